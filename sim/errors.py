@@ -2,11 +2,15 @@
 
 from ..models.errors import ModelError, PantographError, unknown
 
-__all__ = ["EngineError", "FilmError", "ModelError", "PantographError", "RecordingError", "SceneError", "unknown"]
+__all__ = ["EngineError", "FilmError", "KeyingError", "ModelError", "PantographError", "RecordingError", "SceneError", "unknown"]
 
 
 class SceneError(PantographError):
     """A scene file or object contradicts itself or its models; lists every mistake with its place."""
+
+
+class KeyingError(PantographError):
+    """Keys contradict themselves or what they key: order of times, shapes, kinds, ends of a loop, channels."""
 
 
 class EngineError(PantographError):
