@@ -8,7 +8,7 @@ or from the left when asked to; `breaks` lists these times.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +28,7 @@ _SAME = 1e-9  # a jump below this fraction of the curve's largest rate is roundi
 
 
 class Sample(NamedTuple):
-    """A curve at times t: `q` (*t.shape, dim), `v` and `a` (*t.shape, dof), in units of the keys and seconds."""
+    """A curve at times t: `q` (*t.shape, dim), `v` and `a` (*t.shape, dof), in the keys' unit and seconds."""
 
     q: Array
     v: Array
@@ -37,7 +37,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Curve(ABC):
-    """A curve through keys: `times` (k,) [s], `values` (k, dim), pieces between `knots`, and what lies beyond.
+    """A curve through keys: `times` (k,) [s], `values` (k, dim), pieces between `knots`, and its ends.
 
     Subclasses say what a piece is (`_piece`); ends, loops, sides and breaks are the same for all.
     """
@@ -65,7 +65,7 @@ class Curve(ABC):
     @property
     def dim(self) -> int:
         """Numbers a key has: columns of q."""
-        return self.values.shape[1]
+        return int(self.values.shape[1])
 
     @property
     def dof(self) -> int:
@@ -121,7 +121,7 @@ class Curve(ABC):
             jump = self._distance(before[k], after[k]) if k == 0 else np.abs(after[k] - before[k]).max(axis=1)
             order[jump > _SAME * scale] = k
         found = order < 3
-        return _frozen(self.knots[found]), order[found]
+        return frozen(self.knots[found]), order[found]
 
     def _distance(self, q1: Array, q2: Array) -> Array:
         """Largest difference (n,) between positions (n, dim); rotations know that q and -q are one."""
@@ -138,7 +138,7 @@ class Curve(ABC):
         return self._jumps[1]
 
     def breaks_between(self, t0: float, t1: float) -> Array:
-        """Times strictly between `t0` and `t1` where q, v or a jumps, those of every turn of a loop included."""
+        """Times strictly between `t0` and `t1` where q, v or a jumps, in every turn of a loop."""
         period = self.end - self.start
         found = [self.breaks]
         if period > 0 and self.after == "loop":
@@ -165,21 +165,21 @@ def keyed(
     times: ArrayLike,
     values: ArrayLike,
     *,
-    kind: Kind | None = None,
+    kind: Kind = "auto",
     ease: str | None = None,
     before: Beyond = "hold",
     after: Beyond = "hold",
 ) -> PolynomialCurve:
     """Curve through `values` (k,) or (k, d) at increasing `times` (k,) [s].
 
-    `kind` (default `auto`, or `linear` with an ease):
+    `kind`:
       - `step`: each value until the next key; `linear`;
       - `natural`: cubic spline, C2 inside, no acceleration at the ends (periodic C2 in a loop);
       - `clamped`: cubic spline, C2 inside, at rest at the ends;
       - `auto`: monotone cubic (Fritsch & Butland 1984), C1 everywhere: at rest where the keys turn and where
         the curve begins or ends to be held, never outside of the two keys around it.
-    `ease`: name of an easing (`easings.EASINGS`) that shapes the way between every two keys.
-    `before`, `after`: `hold` the end value, or `loop` with period end - start, which needs first value = last.
+    `ease`: name of an easing (`easings.EASINGS`) that times straight ways between keys, instead of a `kind`.
+    `before`, `after`: `hold` the end value, or `loop` with period end - start (first and last value equal).
 
     Raises KeyingError for keys that are unsorted, not finite, of wrong shape, or do not close their loop.
     """
@@ -198,7 +198,7 @@ def keyed(
     else:
         end_condition = "periodic" if loops and kind == "natural" else kind
         coefficients = CubicSpline(t, q, bc_type=end_condition).c
-    return PolynomialCurve(_frozen(t), _frozen(q), _frozen(knots), before, after, _frozen(coefficients))
+    return PolynomialCurve(frozen(t), frozen(q), frozen(knots), before, after, frozen(coefficients))
 
 
 def eased_pieces(t: Array, q0: Array, dq: Array, ease: str | None) -> tuple[Array, Array]:
@@ -249,7 +249,7 @@ def check_keys(times: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:
     return t, q
 
 
-def check_kind(kind: str | None, ease: str | None, before: str, after: str) -> Kind:
+def check_kind(kind: str, ease: str | None, before: str, after: str) -> Kind:
     """The kind that is meant, or KeyingError listing what exists."""
     where = "a curve"
     if ease is not None and ease not in EASINGS:
@@ -257,20 +257,21 @@ def check_kind(kind: str | None, ease: str | None, before: str, after: str) -> K
     for end in (before, after):
         if end not in ("hold", "loop"):
             raise KeyingError(unknown("way to go on beyond the keys", end, ("hold", "loop"), where=where))
-    kind = kind or ("auto" if ease is None else "linear")
-    if ease is not None and kind != "linear":
-        raise KeyingError(f"ease {ease!r} shapes straight ways between keys: leave out kind {kind!r}")
-    for known in KINDS:
-        if kind == known:
-            return known
-    raise KeyingError(unknown("kind of curve", kind, KINDS, where=where))
+    if kind not in KINDS:
+        raise KeyingError(unknown("kind of curve", kind, KINDS, where=where))
+    if ease is None:
+        return cast(Kind, kind)
+    if kind not in ("auto", "linear"):
+        raise KeyingError(f"ease {ease!r} times straight ways between keys: kind {kind!r} cannot be eased")
+    return "linear"
 
 
 def _close(q: Array) -> Array:
     """Values of a loop, the last exactly as the first."""
     if not np.allclose(q[0], q[-1], rtol=0.0, atol=1e-9 * max(1.0, float(np.abs(q).max()))):
         raise KeyingError(
-            f"a loop ends where it begins: the first key is {_show(q[0])}, the last {_show(q[-1])}; make them equal"
+            f"a loop ends where it begins: make the last key ({_show(q[-1])}) "
+            f"equal to the first ({_show(q[0])})"
         )
     return np.concatenate([q[:-1], q[:1]])
 
@@ -279,7 +280,8 @@ def _show(q: Array) -> str:
     return ", ".join(f"{x:.9g}" for x in q)
 
 
-def _frozen(x: Array) -> Array:
+def frozen(x: Array) -> Array:
+    """`x` contiguous and read-only."""
     x = np.ascontiguousarray(x)
     x.setflags(write=False)
     return x
