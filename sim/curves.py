@@ -8,7 +8,7 @@ or from the left when asked to; `breaks` lists these times.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -260,7 +260,7 @@ def check_kind(kind: str, ease: str | None, before: str, after: str) -> Kind:
     if kind not in KINDS:
         raise KeyingError(unknown("kind of curve", kind, KINDS, where=where))
     if ease is None:
-        return cast(Kind, kind)
+        return kind
     if kind not in ("auto", "linear"):
         raise KeyingError(f"ease {ease!r} times straight ways between keys: kind {kind!r} cannot be eased")
     return "linear"

@@ -35,7 +35,7 @@ _MAX_NEWTON = 60
 
 @dataclass(frozen=True, eq=False)
 class RotationCurve(Curve):
-    """Rotations origin_i exp(phi(t)): `origins` (pieces, 4), `coefficients` of phi (degree + 1, pieces, 3)."""
+    """Rotations origin_i exp(phi(t)): `origins` (pieces, 4), `coefficients` of phi (deg + 1, pieces, 3)."""
 
     origins: Array
     coefficients: Array
@@ -98,7 +98,7 @@ def keyed_rotation(
 def _same_side(q: Array) -> Array:
     """Keys (k, 4) with signs such that each is nearest to the one before."""
     sign = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
-    return q * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(sign)])[:, None])
 
 
 def _check_closed(q: Array) -> None:
@@ -147,7 +147,8 @@ def _limited_rates(h: Array, arcs: Array, loops: bool) -> Array:
     slower, faster = np.minimum(s0, s1), np.maximum(s0, s1)
     ratio = np.divide(slower, faster, out=np.zeros_like(slower), where=faster > 0)
     weight = np.where(s0 < s1, w0 + w1 * ratio, w0 * ratio + w1)  # no product of speeds: it could underflow
-    return slower * (w0 + w1) / weight * 0.5 * (direction[:-1] + direction[1:])
+    speed_at_key = slower * (w0 + w1) / weight
+    return np.asarray(speed_at_key * 0.5 * (direction[:-1] + direction[1:]))
 
 
 def _spline_rates(h: Array, arcs: Array, kind: Kind, loops: bool) -> Array:
@@ -192,8 +193,8 @@ def _spline_rates(h: Array, arcs: Array, kind: Kind, loops: bool) -> Array:
         columns = (bend(at + axes) - bend(at) - bend(np.broadcast_to(axes, (3, m, 3)))) / axes.max()
         return linear + _blocks([(right, right, np.moveaxis(columns, 0, -1))], k)
 
-    w = _newton(residual, jacobian, free).reshape(k, 3)
-    return (np.concatenate([w, w[:1]]) if closed else w) / unit
+    w = _newton(residual, jacobian, free).reshape(k, 3) / unit
+    return np.concatenate([w, w[:1]]) if closed else w
 
 
 def _blocks(entries: list[tuple[NDArray[np.intp], NDArray[np.intp], Array]], k: int) -> Any:

@@ -34,7 +34,7 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 def conjugate(q: ArrayLike) -> Array:
     """Inverse rotation (..., 4)."""
-    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+    return np.asarray(np.asarray(q, dtype=float) * [1.0, -1.0, -1.0, -1.0])
 
 
 def normalize(q: ArrayLike) -> Array:
@@ -92,7 +92,7 @@ def from_matrix(R: ArrayLike) -> Array:
 
 
 def from_euler(seq: str, angles: ArrayLike) -> Array:
-    """Quaternions (..., 4) of angles (..., len(seq)) [rad] about fixed axes ("xyz") or moving ones ("XYZ")."""
+    """Quaternions (..., 4) of angles (..., len(seq)) [rad] about fixed ("xyz") or moving axes ("XYZ")."""
     angles = np.asarray(angles, dtype=float)
     if angles.shape[-1:] != (len(seq),):
         raise KeyingError(
@@ -186,7 +186,7 @@ def _jacobian_coefficients(phi: Array) -> tuple[Array, Array, Array, Array]:
     small = np.minimum(th, 1.5) ** 2
     series = [np.polynomial.polynomial.polyval(small, c) for c in _TAYLOR]
     if (th < 1.5).all():
-        return tuple(series)  # type: ignore[return-value]
+        return tuple(series)
     x = np.maximum(th, 1.5)
     s, c = np.sin(x), np.cos(x)
     closed = (
