@@ -1,0 +1,26 @@
+"""Robots and scenes as data, and the way to load them."""
+
+from .chain import chain
+from .diagnose import captured_warnings
+from .errors import ModelError, ModelWarning, PantographError, unknown
+from .library import data_robots, find, load_model, load_spec, names
+from .naming import Kind, joint_names, lookup, name_of, names_of
+
+__all__ = [
+    "Kind",
+    "ModelError",
+    "ModelWarning",
+    "PantographError",
+    "captured_warnings",
+    "chain",
+    "data_robots",
+    "find",
+    "joint_names",
+    "load_model",
+    "load_spec",
+    "lookup",
+    "name_of",
+    "names",
+    "names_of",
+    "unknown",
+]

@@ -5,11 +5,15 @@ from difflib import get_close_matches
 
 
 class PantographError(Exception):
-    """Base of every error raised on purpose: its message says what is wrong, where, and what would be right."""
+    """Base of every error raised on purpose: its message says what is wrong, where, what would be right."""
 
 
 class ModelError(PantographError):
     """A model file is missing or broken, or a name in it does not exist."""
+
+
+class ModelWarning(UserWarning):
+    """A model was loaded, but not exactly as its file has it: the message says what was changed."""
 
 
 def unknown(kind: str, name: str, known: Iterable[str], *, where: str = "this model") -> str:
