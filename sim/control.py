@@ -1,0 +1,146 @@
+"""How a control law meets a scene: sampled at its own period, held in between, through the actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .clip import Clip
+from .engines.interface import Array, Drive, Held, Problem, Role
+
+_FIRST_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+class Target(NamedTuple):
+    """Where the keys want the scene: q (nq,), v (nv,), a (nv,)."""
+
+    q: Array
+    v: Array
+    a: Array
+
+
+class Law(Protocol):
+    """A control law: the same input and memory give the same output, in any order of calls."""
+
+    def start(self) -> Any:
+        """Memory before the first sample; None for a law without memory."""
+        ...
+
+    def __call__(self, t: float, q: Array, v: Array, target: Target, memory: Any) -> tuple[Array, Any]:
+        """Joint forces tau (nv,) [N, N m] at time t [s] and state q (nq,), v (nv,); and the new memory."""
+        ...
+
+
+class Sampled:
+    """A law sampled every ``period`` seconds, its forces delivered through the model's actuators.
+
+    A tracked joint with an actuator in the drive ``controller`` gets its force from it, within the limits
+    of the actuator; one without gets it as an ideal joint force.
+    """
+
+    def __init__(self, law: Law, problem: Problem, period: float) -> None:
+        self.law, self.period = law, period
+        self.clip: Clip = problem.clip
+        self.tracked = problem.dofs(Role.TRACKED)
+        self.actuators = controlled_actuators(problem.model, problem.drives)
+        self.memory = law.start()
+        self.nu = problem.model.nu
+        ticks = np.arange(int(np.ceil(problem.duration / period - 1e-9)) + 1) * period
+        self.targets = self.clip.evaluate(ticks)
+
+    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
+        """See :class:`~pantograph.sim.engines.interface.Controls`."""
+        target = Target(self.targets.q[k], self.targets.v[k], self.targets.a[k])
+        tau, self.memory = self.law(t, q, v, target, self.memory)
+        qfrc = np.where(self.tracked, tau, 0.0)
+        ctrl = np.zeros(self.nu)
+        for actuator in self.actuators:
+            ctrl[actuator.index] = actuator.ctrl_for(float(qfrc[actuator.dof]), q, v)
+            qfrc[actuator.dof] = 0.0
+        return Held(ctrl, qfrc)
+
+
+class Replay:
+    """The recorded samples of a controller, played again: same inputs, whatever the state."""
+
+    def __init__(self, period: float, ctrl: Array, qfrc: Array) -> None:
+        self.period, self._ctrl, self._qfrc = period, ctrl, qfrc
+
+    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
+        """See :class:`~pantograph.sim.engines.interface.Controls`."""
+        k = min(k, len(self._ctrl) - 1)
+        return Held(self._ctrl[k], self._qfrc[k])
+
+
+@dataclass(frozen=True)
+class JointActuator:
+    """An actuator on one joint, MuJoCo's affine law: force = (g0 + g1 l + g2 l') ctrl + b0 + b1 l + b2 l',
+    l = gear q, joint force = gear * force (MuJoCo documentation, Computation, Actuation model)."""
+
+    index: int
+    dof: int
+    qpos: int
+    gear: float
+    gain: Array
+    bias: Array
+    ctrl_range: tuple[float, float]
+
+    def ctrl_for(self, tau: float, q: Array, v: Array) -> float:
+        """The ctrl that gives joint force ``tau`` [N, N m] now, within the control range."""
+        length, rate = self.gear * q[self.qpos], self.gear * v[self.dof]
+        now = np.array([1.0, length, rate])
+        gain = float(self.gain @ now)
+        force = tau / self.gear
+        ctrl = (force - float(self.bias @ now)) / gain if gain != 0.0 else 0.0
+        return float(np.clip(ctrl, *self.ctrl_range))
+
+
+def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> tuple[JointActuator, ...]:
+    """The actuators that the controller drives."""
+    found = []
+    for i in np.flatnonzero(drives == Drive.CONTROLLER):
+        joint = int(model.actuator_trnid[i, 0])
+        limited = bool(model.actuator_ctrllimited[i])
+        low, high = model.actuator_ctrlrange[i] if limited else (-np.inf, np.inf)
+        found.append(
+            JointActuator(
+                index=int(i),
+                dof=int(model.jnt_dofadr[joint]),
+                qpos=int(model.jnt_qposadr[joint]),
+                gear=float(model.actuator_gear[i, 0]),
+                gain=model.actuator_gainprm[i, :3].copy(),
+                bias=model.actuator_biasprm[i, :3].copy(),
+                ctrl_range=(float(low), float(high)),
+            )
+        )
+    return tuple(found)
+
+
+def why_not_controllable(model: mujoco.MjModel, i: int) -> str:
+    """Why a controller cannot drive actuator ``i``; empty when it can."""
+    if model.actuator_trntype[i] not in _FIRST_JOINT_TRANSMISSIONS:
+        return "it does not act on one joint"
+    joint = int(model.actuator_trnid[i, 0])
+    if model.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        return "it acts on a ball or free joint"
+    if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+        return "it has activation dynamics"
+    affine = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+    if model.actuator_gaintype[i] not in affine or model.actuator_biastype[i] not in (
+        mujoco.mjtBias.mjBIAS_NONE,
+        mujoco.mjtBias.mjBIAS_AFFINE,
+    ):
+        return "its force is no affine function of its control"
+    return ""
+
+
+def is_position_servo(model: mujoco.MjModel, i: int) -> bool:
+    """Whether actuator ``i`` pulls its length towards its control: force = kp (ctrl - l) - ..."""
+    gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
+    return bool(
+        model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and gain[0] > 0 and bias[1] == -gain[0]
+    )

@@ -1,0 +1,299 @@
+"""The contact engine: MuJoCo's physics, with keyed motion prescribed at every evaluation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..errors import EngineError
+from .derive import apply_wrenches
+from .interface import Array, Controls, Held, Problem, Role, Segment, State
+from .prescribe import Prescriber
+from .timed import Timed, TimedInputs
+
+INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+}
+ORDER = {"euler": 1, "rk4": 4, "implicit": 1, "implicitfast": 1, "discrete": 1}
+
+_CHUNK = 1024  # steps whose prescribed inputs are evaluated at once
+_HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) for a state that makes sense
+
+
+class ContactEngine:
+    """MuJoCo behind the common interface."""
+
+    name = "contact"
+
+    def run(
+        self,
+        problem: Problem,
+        t_span: tuple[float, float],
+        controls: Controls | None,
+        *,
+        progress: Callable[[float], None] | None = None,
+    ) -> Segment:
+        """See :class:`~pantograph.sim.engines.interface.Engine`."""
+        if problem.integrator not in INTEGRATORS:
+            raise EngineError(
+                f"the contact engine has no integrator {problem.integrator!r}; "
+                f"it has: {', '.join(sorted(INTEGRATORS))}"
+            )
+        return _Run(problem, t_span, controls).segment(progress)
+
+
+class _Run:
+    """State of one run."""
+
+    def __init__(self, problem: Problem, t_span: tuple[float, float], controls: Controls | None) -> None:
+        self.problem, self.controls, self.t0 = problem, controls, t_span[0]
+        self.h = problem.step
+        self.steps = round((t_span[1] - t_span[0]) / self.h)
+        self.per_tick = round(controls.period / self.h) if controls else 0
+        if controls and abs(self.per_tick * self.h - controls.period) > 1e-9 * controls.period:
+            raise EngineError(
+                f"the controller's period {controls.period:g} s is no whole multiple of the step {self.h:g} s"
+            )
+        self.prescriber = Prescriber(problem.model, problem.dofs(Role.KEYED))
+        self.model = self.prescriber.model
+        self.model.opt.timestep = self.h
+        self.model.opt.integrator = int(INTEGRATORS[problem.integrator])
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.data = mujoco.MjData(self.model)
+        self.timed = Timed(problem)
+        self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
+        self.quat = _quaternion_joints(self.model)
+        self.evaluations = 0
+        self.samples: list[tuple[float, State]] = []
+        self.ticks: list[tuple[float, Held]] = []
+
+    def segment(self, progress: Callable[[float], None] | None) -> Segment:
+        started, status, message, k = time.perf_counter(), "done", "", 0
+        self._start()
+        try:
+            while True:
+                self._stop_at(k)
+                if message := self._nonsense(k):
+                    status = "diverged"
+                    break
+                if k >= self.steps:
+                    break
+                n = self._until_next(k)
+                self._advance(k, n)
+                k += n
+                if progress:
+                    progress(self.t0 + k * self.h)
+        except KeyboardInterrupt:
+            status, message = "interrupted", f"interrupted at t = {self.t0 + k * self.h:.4g} s"
+        return self._result(status, message, k, time.perf_counter() - started)
+
+    def _start(self) -> None:
+        d, s = self.data, self.problem.state0
+        d.qpos[:], d.qvel[:], d.time = s.q, s.v, self.t0
+        if self.model.na:
+            d.act[:] = s.act
+        inputs = self.timed.at(np.array([self.t0]))
+        self._prescribe_state(inputs, 0)
+        self._apply(inputs, 0)
+        self.prescriber.settle(d, self.held.qfrc, inputs.a[0])
+
+    def _until_next(self, k: int) -> int:
+        stops = [self.steps - k, self.problem.sample_every - k % self.problem.sample_every]
+        if self.per_tick:
+            stops.append(self.per_tick - k % self.per_tick)
+        return min(stops)
+
+    def _stop_at(self, k: int) -> None:
+        """Record and sample the controller where step ``k`` begins, if it is time for it."""
+        t, d = self.t0 + k * self.h, self.data
+        if k % self.problem.sample_every == 0 or k == self.steps:
+            self.samples.append((t, State(d.qpos.copy(), d.qvel.copy(), d.act.copy())))
+        if self.controls and self.per_tick and k % self.per_tick == 0 and k < self.steps:
+            self.held = self.controls.sample(k // self.per_tick, t, d.qpos.copy(), d.qvel.copy())
+            self.ticks.append((t, self.held))
+
+    def _advance(self, k: int, n: int) -> None:
+        self.data.ctrl[:] = self.held.ctrl
+        if self.timed.empty:
+            self.data.qfrc_applied[:] = self.held.qfrc
+            self.data.time = self.t0 + k * self.h
+            mujoco.mj_step(self.model, self.data, n)
+            self.evaluations += n * (4 if self.problem.integrator == "rk4" else 1)
+            return
+        for first in range(k, k + n, _CHUNK):
+            count = min(_CHUNK, k + n - first)
+            if self.problem.integrator == "rk4":
+                self._runge_kutta(first, count)
+            else:
+                self._native(first, count)
+
+    def _runge_kutta(self, k: int, n: int) -> None:
+        """Classical RK4 whose stages see the prescribed inputs at their own times.
+
+        Orientation is integrated as the quaternion ODE qdot = q * (0, w) / 2 and normalised after the
+        step, which keeps order 4. A step's last stage takes the limit from the left, where keys may bend.
+        """
+        h, d = self.h, self.data
+        begin = self.t0 + np.arange(k, k + n) * h
+        stages = (
+            self.timed.at(begin),
+            self.timed.at(begin + h / 2),
+            self.timed.at(self.t0 + np.arange(k + 1, k + n + 1) * h, left=True),
+        )
+        for i in range(n):
+            q0, v0, act0 = d.qpos.copy(), d.qvel.copy(), d.act.copy()
+            rates: list[tuple[Array, Array, Array]] = []
+            for inputs, c in zip(
+                (stages[0], stages[1], stages[1], stages[2]), (0.0, 0.5, 0.5, 1.0), strict=True
+            ):
+                if rates:
+                    dq, dv, dact = rates[-1]
+                    d.qpos[:], d.qvel[:], d.act[:] = q0 + c * h * dq, v0 + c * h * dv, act0 + c * h * dact
+                d.time = self.t0 + (k + i + c) * h
+                self._prescribe_state(inputs, i)
+                self._apply(inputs, i)
+                self.prescriber.forward(d, self.held.qfrc, inputs.a[i])
+                rates.append((self._qdot(), d.qacc.copy(), d.act_dot.copy()))
+            weights = (h / 6, h / 3, h / 3, h / 6)
+            d.qpos[:] = q0 + sum(w * r[0] for w, r in zip(weights, rates, strict=True))
+            d.qvel[:] = v0 + sum(w * r[1] for w, r in zip(weights, rates, strict=True))
+            d.act[:] = act0 + sum(w * r[2] for w, r in zip(weights, rates, strict=True))
+            mujoco.mj_normalizeQuat(self.model, d.qpos)
+            self.evaluations += 4
+        self._land(k + n)
+
+    def _native(self, k: int, n: int) -> None:
+        """MuJoCo's one-stage integrators; keyed joints get the mean acceleration over the step."""
+        h, d = self.h, self.data
+        inputs = self.timed.at(self.t0 + np.arange(k, k + n + 1) * h)
+        p = self.prescriber
+        for i in range(n):
+            self._prescribe_state(inputs, i)
+            self._apply(inputs, i)
+            d.qfrc_applied[:] = self.held.qfrc
+            a_key = (inputs.v[i + 1] - inputs.v[i]) / h
+            if len(p.keyed):
+                d.qfrc_applied[p.keyed] = p.armature * a_key + p.lag
+            mujoco.mj_step(self.model, d)
+            if len(p.keyed):
+                p.lag = p.lag + p.armature * (a_key - d.qacc[p.keyed])
+            self.evaluations += 1
+        self._prescribe_state(inputs, n)
+
+    def _land(self, k: int) -> None:
+        """Put keyed joints where their keys say at the start of step ``k``, free of rounding drift."""
+        self.data.time = self.t0 + k * self.h
+        self._prescribe_state(self.timed.at(np.array([self.data.time])), 0)
+
+    def _prescribe_state(self, inputs: TimedInputs, row: int) -> None:
+        self.data.qpos[self.timed.qpos] = inputs.q[row]
+        self.data.qvel[self.timed.keyed] = inputs.v[row]
+
+    def _apply(self, inputs: TimedInputs, row: int) -> None:
+        """Controls and wrenches of one evaluation."""
+        d = self.data
+        d.ctrl[:] = self.held.ctrl
+        d.ctrl[self.timed.servos] = inputs.ctrl[row]
+        apply_wrenches(self.model, d, self.timed, inputs.wrench[row])
+
+    def _qdot(self) -> Array:
+        """Time derivative of qpos (nq,): velocities, and quaternion rates of ball and free joints."""
+        d, m = self.data, self.model
+        out = np.empty(m.nq)
+        scalar_q, scalar_v, quat_q, quat_v = self.quat
+        out[scalar_q] = d.qvel[scalar_v]
+        for iq, iv in zip(quat_q, quat_v, strict=True):
+            w, x, y, z = d.qpos[iq : iq + 4]
+            p, r, s = 0.5 * d.qvel[iv : iv + 3]
+            out[iq] = -x * p - y * r - z * s
+            out[iq + 1] = w * p + y * s - z * r
+            out[iq + 2] = w * r + z * p - x * s
+            out[iq + 3] = w * s + x * r - y * p
+        return out
+
+    def _nonsense(self, k: int) -> str:
+        """Why the state at step ``k`` makes no sense, or an empty string."""
+        d, m = self.data, self.model
+        bad = ~np.isfinite(d.qvel) | (np.abs(d.qvel) > _HUGE)
+        warned = any(
+            d.warning[w].number for w in (mujoco.mjtWarning.mjWARN_BADQACC, mujoco.mjtWarning.mjWARN_BADQPOS)
+        )
+        if not bad.any() and np.isfinite(d.qpos).all() and not warned:
+            return ""
+        speed = np.where(np.isfinite(d.qvel), np.abs(d.qvel), np.inf)
+        joint = m.joint(int(m.dof_jntid[int(np.argmax(speed))])).name or "an unnamed joint"
+        return (
+            f"diverged at t = {self.t0 + k * self.h:.4g} s at joint {joint!r}: "
+            f"with {self.problem.integrator} and a step of {self.h:g} s {self._cause()}"
+        )
+
+    def _cause(self) -> str:
+        m, h = self.model, self.h
+        kp = float(np.max(np.abs(m.actuator_gainprm[:, 0]), initial=0.0))
+        stiff = float(np.max(np.abs(m.jnt_stiffness), initial=0.0))
+        if max(kp, stiff) * h * h > 1e-3 * float(m.stat.meaninertia):
+            return (
+                f"the springs or servo gains (up to {max(kp, stiff):g}) are probably too stiff; "
+                "try integrator = 'discrete' or a smaller step"
+            )
+        return "the motion is too fast for the step; try a smaller one, or check forces and initial state"
+
+    def _result(self, status: str, message: str, k: int, wall: float) -> Segment:
+        if status == "diverged":
+            self.samples = [
+                s for s in self.samples if np.isfinite(s[1].q).all() and np.isfinite(s[1].v).all()
+            ]
+        m = self.model
+        stats: dict[str, Any] = {
+            "engine": "contact",
+            "integrator": self.problem.integrator,
+            "step": self.h,
+            "steps": k,
+            "evaluations": self.evaluations,
+            "wall_s": wall,
+        }
+        return Segment(
+            t=np.array([t for t, _ in self.samples]),
+            q=_rows([s.q for _, s in self.samples], m.nq),
+            v=_rows([s.v for _, s in self.samples], m.nv),
+            act=_rows([s.act for _, s in self.samples], m.na),
+            tick_t=np.array([t for t, _ in self.ticks]),
+            tick_ctrl=_rows([u.ctrl for _, u in self.ticks], m.nu),
+            tick_qfrc=_rows([u.qfrc for _, u in self.ticks], m.nv),
+            status=status,
+            message=message,
+            stats=stats,
+        )
+
+
+def _rows(rows: list[Array], width: int) -> Array:
+    return np.array(rows, dtype=float).reshape(len(rows), width)
+
+
+def _quaternion_joints(model: mujoco.MjModel) -> tuple[Array, Array, list[int], list[int]]:
+    """Indices (qpos, dof) of coordinates that are their own rates, and starts of quaternion parts."""
+    scalar_q: list[int] = []
+    scalar_v: list[int] = []
+    quat_q: list[int] = []
+    quat_v: list[int] = []
+    for joint in range(model.njnt):
+        iq, iv, kind = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            scalar_q += [iq, iq + 1, iq + 2]
+            scalar_v += [iv, iv + 1, iv + 2]
+            iq, iv = iq + 3, iv + 3
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            quat_q.append(int(iq))
+            quat_v.append(int(iv))
+        else:
+            scalar_q.append(int(iq))
+            scalar_v.append(int(iv))
+    return np.array(scalar_q, dtype=int), np.array(scalar_v, dtype=int), quat_q, quat_v

@@ -1,0 +1,110 @@
+"""What follows from recorded states: accelerations, drive forces, energies, contacts and limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from ...models import name_of
+from .interface import Array, Event, Problem, Role, Segment
+from .prescribe import Prescriber
+from .timed import Timed
+
+
+@dataclass(frozen=True)
+class Derived:
+    """Quantities that belong to the recorded states, not to the step before (n samples).
+
+    a (n, nv); tau (n, nv): force of actuators, controllers and, on keyed joints, the force that a drive
+    needs for the keyed motion [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,): sum of
+    contact normal forces [N]; events.
+    """
+
+    a: Array
+    tau: Array
+    ctrl: Array
+    kinetic: Array
+    potential: Array
+    normal: Array
+    events: tuple[Event, ...]
+
+
+def derive(problem: Problem, segment: Segment) -> Derived:
+    """Evaluate the model at every sample of ``segment``."""
+    m, n = problem.model, len(segment.t)
+    p = Prescriber(m, problem.dofs(Role.KEYED))
+    p.model.opt.timestep = problem.step
+    d, plain = mujoco.MjData(p.model), mujoco.MjData(m)
+    timed = Timed(problem)
+    inputs = timed.at(segment.t)
+    a, tau, ctrl = np.zeros((n, m.nv)), np.zeros((n, m.nv)), np.zeros((n, m.nu))
+    kinetic, potential, normal = np.zeros(n), np.zeros(n), np.zeros(n)
+    events: list[Event] = []
+    touching: set[tuple[str, str]] = set()
+    tick = np.searchsorted(segment.tick_t, segment.t + 1e-9, side="right") - 1
+    for i in range(n):
+        d.qpos[:], d.qvel[:], d.act[:], d.time = segment.q[i], segment.v[i], segment.act[i], segment.t[i]
+        held = tick[i] >= 0
+        d.ctrl[:] = segment.tick_ctrl[tick[i]] if held else 0.0
+        d.ctrl[timed.servos] = inputs.ctrl[i]
+        qfrc = segment.tick_qfrc[tick[i]] if held else np.zeros(m.nv)
+        apply_wrenches(p.model, d, timed, inputs.wrench[i])
+        p.settle(d, qfrc, inputs.a[i])
+        a[i], ctrl[i] = d.qacc, d.ctrl
+        tau[i] = d.qfrc_actuator + qfrc
+        tau[i, p.keyed] = p.lag
+        now, normal[i] = _active(p.model, d)
+        events += _changes(segment.t[i], touching, now)
+        touching = now
+        kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
+    return Derived(a, tau, ctrl, kinetic, potential, normal, tuple(events))
+
+
+def apply_wrenches(model: mujoco.MjModel, data: mujoco.MjData, timed: Timed, wrench: Array) -> None:
+    """Write the wrenches (w, 6) of one time into ``xfrc_applied``, body frames turned into the world."""
+    if not len(timed.bodies):
+        return
+    if timed.body_frame.any():
+        mujoco.mj_kinematics(model, data)
+    data.xfrc_applied[:] = 0.0
+    for body, local, w in zip(timed.bodies, timed.body_frame, wrench, strict=True):
+        R_WB = data.xmat[body].reshape(3, 3) if local else np.eye(3)
+        data.xfrc_applied[body, :3] += R_WB @ w[:3]
+        data.xfrc_applied[body, 3:] += R_WB @ w[3:]
+
+
+def _energy(model: mujoco.MjModel, data: mujoco.MjData, q: Array, v: Array) -> tuple[float, float]:
+    data.qpos[:], data.qvel[:] = q, v
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_energyPos(model, data)
+    mujoco.mj_energyVel(model, data)
+    return float(data.energy[1]), float(data.energy[0])
+
+
+def _active(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[set[tuple[str, str]], float]:
+    """Touching pairs of bodies and joints at a limit, as (kind, what); and the sum of normal forces."""
+    now: set[tuple[str, str]] = set()
+    total, force = 0.0, np.zeros(6)
+    for c in range(data.ncon):
+        contact = data.contact[c]
+        if contact.efc_address < 0:
+            continue
+        mujoco.mj_contactForce(model, data, c, force)
+        if force[0] <= 0:
+            continue
+        total += float(force[0])
+        names = sorted(name_of(model, "body", int(model.geom_bodyid[g])) for g in contact.geom)
+        now.add(("contact", " - ".join(names)))
+    limits = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
+    for row in limits:
+        if data.efc_force[row] > 0:
+            now.add(("limit", name_of(model, "joint", int(data.efc_id[row]))))
+    return now, total
+
+
+def _changes(t: float, before: set[tuple[str, str]], now: set[tuple[str, str]]) -> list[Event]:
+    begun = [Event(float(t), kind, what) for kind, what in sorted(now - before)]
+    ended = [Event(float(t), f"{kind} end", what) for kind, what in sorted(before - now)]
+    return begun + ended

@@ -1,0 +1,76 @@
+"""Everything that a scene prescribes over time, as arrays at the times where an engine needs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .interface import Array, Drive, Problem, Role
+
+
+@dataclass(frozen=True)
+class TimedInputs:
+    """Prescribed inputs at n times.
+
+    Keyed joints: q (n, nqk), v (n, k), a (n, k); servo ctrl (n, s); wrenches on bodies (n, w, 6), force
+    before torque.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    ctrl: Array
+    wrench: Array
+
+
+class Timed:
+    """Evaluates the prescribed inputs of a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.keyed = np.flatnonzero(problem.dofs(Role.KEYED))
+        self.qpos = np.flatnonzero(keyed_qpos(problem))
+        self.servos = np.array(sorted(problem.servo), dtype=int)
+        self.bodies = np.array([w.body for w in problem.wrenches], dtype=int)
+        self.body_frame = np.array([w.in_body_frame for w in problem.wrenches], dtype=bool)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing depends on time, so that steps need no Python between them."""
+        return not (len(self.keyed) or len(self.servos) or len(self.bodies))
+
+    def at(self, t: Array, *, left: bool = False) -> TimedInputs:
+        """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
+        n, k = len(t), len(self.keyed)
+        q, v, a = np.zeros((n, len(self.qpos))), np.zeros((n, k)), np.zeros((n, k))
+        if k:
+            motion = self.problem.clip.evaluate(t, left=left)
+            q, v, a = motion.q[:, self.qpos], motion.v[:, self.keyed], motion.a[:, self.keyed]
+        ctrl = np.zeros((n, len(self.servos)))
+        for i, actuator in enumerate(self.servos):
+            ctrl[:, i] = self.problem.servo[int(actuator)](t)
+        wrench = np.zeros((n, len(self.bodies), 6))
+        for i, w in enumerate(self.problem.wrenches):
+            on = ((t >= w.start) & (t < w.stop))[:, None]
+            if w.force is not None:
+                wrench[:, i, :3] = np.where(on, w.force(t).q, 0.0)
+            if w.torque is not None:
+                wrench[:, i, 3:] = np.where(on, w.torque(t).q, 0.0)
+        return TimedInputs(q, v, a, ctrl, wrench)
+
+
+def keyed_qpos(problem: Problem) -> np.ndarray:
+    """Mask (nq,) of the coordinates of keyed joints."""
+    m = problem.model
+    mask = np.zeros(m.nq, dtype=bool)
+    width = {0: 7, 1: 4, 2: 1, 3: 1}
+    for joint in np.flatnonzero(problem.roles == Role.KEYED):
+        start = m.jnt_qposadr[joint]
+        mask[start : start + width[int(m.jnt_type[joint])]] = True
+    return mask
+
+
+def driven_by_keys(problem: Problem) -> np.ndarray:
+    """Actuators (nu,) mask whose ctrl comes from keys."""
+    return np.asarray(problem.drives == Drive.KEYS, dtype=bool)

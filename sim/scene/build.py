@@ -1,0 +1,342 @@
+"""From a scene to what engines need: model, roles, motion, drives, forces and the initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ...models import name_of
+from ..clip import Clip
+from ..control import is_position_servo, why_not_controllable
+from ..engines.interface import Array, Drive, Role, State, Wrench
+from ..engines.prescribe import prescribed_bodies
+from ..errors import PantographError, SceneError
+from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
+from .mistakes import Mistake, report
+from .motion import Curves, constant_or_keyed, curves
+from .names import Names
+from .schema import Scene
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A scene resolved against its models; the plan decides how to compute it.
+
+    ``model`` has the scene's switches applied, ``as_filed`` has none of them. ``coupled`` names joints that
+    follow a keyed joint through an equality of the model.
+    """
+
+    scene: Scene
+    model: mujoco.MjModel
+    as_filed: mujoco.MjModel
+    roles: NDArray[np.int8]
+    clip: Clip
+    curves: Curves
+    coupled: tuple[str, ...]
+    drives: NDArray[np.int8]
+    servo: dict[int, Callable[[Array], Array]]
+    wrenches: tuple[Wrench, ...]
+    state0: State
+
+
+def build(scene: Scene) -> Setup:
+    """Resolve a scene. Raises SceneError with all its mistakes."""
+    setup, mistakes = _resolve(scene)
+    if mistakes or setup is None:
+        raise report(mistakes, scene._file, scene._lines)
+    return setup
+
+
+def check(scene: Scene) -> list[Mistake]:
+    """Mistakes that need the models to be seen."""
+    return _resolve(scene)[1]
+
+
+def _resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
+    spec, mistakes = assemble(scene)
+    if spec is None:
+        return None, mistakes + _law(scene)
+    try:
+        model = spec.compile()
+        name_everything(spec)
+        model = spec.compile()
+    except ValueError as e:
+        return None, [*mistakes, Mistake(("models",), f"the models do not fit together: {e}")]
+    mistakes += _law(scene)
+    found, wrong = curves(scene, model)
+    mistakes += wrong
+    roles, wrong = _roles(scene, model, found)
+    mistakes += wrong
+    mistakes += apply_contacts(spec, model, scene)
+    state0, wrong = _initial(scene, model)
+    mistakes += wrong
+    wrenches, wrong = _wrenches(scene, model)
+    mistakes += wrong
+    mistakes += _film_names(scene, model)
+    if mistakes:
+        # drives need settled roles; their own mistakes still belong into the report
+        return None, mistakes + _drives(scene, model, roles, found)[2]
+    try:
+        clip, coupled = _clip(model, found, roles, state0.q)
+    except PantographError as e:
+        return None, [Mistake(("keys",), str(e))]
+    keyed = np.asarray(roles[model.dof_jntid] == Role.KEYED)
+    prescribed = prescribed_bodies(model, keyed)
+    exclude_prescribed(spec, model, prescribed)
+    as_filed, model = model, spec.compile()
+    clip = Clip(model, clip.tracks, clip.q0)
+    _switches(scene, model)
+    _silence_equalities(model, prescribed, roles)
+    drives, servo, wrong = _drives(scene, model, roles, found, clip)
+    if wrong:
+        return None, wrong
+    state0 = _start_on_keys(scene, model, clip, state0)
+    return Setup(scene, model, as_filed, roles, clip, found, coupled, drives, servo, wrenches, state0), []
+
+
+def _law(scene: Scene) -> list[Mistake]:
+    from ..compose import check_law
+
+    if scene.controller is None:
+        return []
+    try:
+        check_law(scene.controller.law, scene.controller.parameters)
+    except SceneError as e:
+        return [Mistake(("controller",), str(e))]
+    return []
+
+
+def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[np.int8], list[Mistake]]:
+    """Role of each joint: named ones as the scene says, joints with keys keyed, the others passive."""
+    roles = np.full(model.njnt, Role.PASSIVE, dtype=np.int8)
+    roles[list(found.tracks)] = Role.KEYED
+    joints, mistakes = Names(model, "joint"), []
+    exact: dict[int, str] = {}
+    for role in (Role.PASSIVE, Role.TRACKED, Role.KEYED):
+        word = role.name.lower()
+        for i, pattern in enumerate(getattr(scene.roles, word)):
+            ids = joints.match(pattern)
+            if not ids:
+                mistakes.append(Mistake(("roles", word, i), joints.missing(pattern)))
+            for j in ids:
+                if pattern in joints.ids:
+                    if exact.get(j, word) != word:
+                        message = f"joint {pattern!r} is named as {exact[j]} too; give it one role"
+                        mistakes.append(Mistake(("roles", word, i), message))
+                    exact[j] = word
+                elif j in exact:
+                    continue
+                roles[j] = role
+    for j in np.flatnonzero(roles == Role.KEYED):
+        if int(j) not in found.tracks:
+            name = name_of(model, "joint", int(j))
+            message = f"joint {name!r} is keyed but has no keys; add [[keys]] joint = {name!r}"
+            mistakes.append(Mistake(("roles", "keyed"), message))
+    return roles, mistakes
+
+
+def _initial(scene: Scene, model: mujoco.MjModel) -> tuple[State, list[Mistake]]:
+    data, mistakes = mujoco.MjData(model), []
+    joints = Names(model, "joint")
+    if scene.initial.keyframe is not None:
+        names = {model.key(k).name: k for k in range(model.nkey)}
+        if scene.initial.keyframe in names:
+            mujoco.mj_resetDataKeyframe(model, data, names[scene.initial.keyframe])
+        else:
+            listing = ", ".join(sorted(n for n in names if n)) or "none"
+            message = f"no keyframe {scene.initial.keyframe!r}; the model has: {listing}"
+            mistakes.append(Mistake(("initial", "keyframe"), message))
+    for word, array, start in (
+        ("position", data.qpos, model.jnt_qposadr),
+        ("velocity", data.qvel, model.jnt_dofadr),
+    ):
+        for name, value in getattr(scene.initial, word).items():
+            path = ("initial", word, name)
+            if name not in joints.ids:
+                mistakes.append(Mistake(path, joints.missing(name)))
+                continue
+            joint = joints.ids[name]
+            row = np.atleast_1d(np.asarray(value, dtype=float))
+            width = _width(model, joint, word)
+            if len(row) != width:
+                mistakes.append(Mistake(path, f"needs {width} number{'s' * (width > 1)}, got {len(row)}"))
+                continue
+            if scene.angle == "degree" and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+                row = np.deg2rad(row)
+            array[start[joint] : start[joint] + width] = row
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    return State(data.qpos.copy(), data.qvel.copy(), data.act.copy()), mistakes
+
+
+def _width(model: mujoco.MjModel, joint: int, word: str) -> int:
+    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+    if kind == mujoco.mjtJoint.mjJNT_FREE:
+        return 7 if word == "position" else 6
+    if kind == mujoco.mjtJoint.mjJNT_BALL:
+        return 4 if word == "position" else 3
+    return 1
+
+
+def _start_on_keys(scene: Scene, model: mujoco.MjModel, clip: Clip, state0: State) -> State:
+    """Joints with keys start on them, tracked ones unless the scene gives them a state of their own."""
+    motion = clip.evaluate(0.0)
+    q, v = state0.q.copy(), state0.v.copy()
+    q[clip.qpos_mask], v[clip.dofs] = motion.q[clip.qpos_mask], motion.v[clip.dofs]
+    joints = Names(model, "joint").ids
+    for name in {*scene.initial.position, *scene.initial.velocity}:
+        joint = joints[name]
+        iq, iv = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        nq, nv = _width(model, joint, "position"), _width(model, joint, "velocity")
+        if name in scene.initial.position:
+            q[iq : iq + nq] = state0.q[iq : iq + nq]
+        if name in scene.initial.velocity:
+            v[iv : iv + nv] = state0.v[iv : iv + nv]
+    return State(q, v, state0.act)
+
+
+def _wrenches(scene: Scene, model: mujoco.MjModel) -> tuple[tuple[Wrench, ...], list[Mistake]]:
+    bodies, out, mistakes = Names(model, "body"), [], []
+    for i, item in enumerate(scene.forces):
+        if item.body not in bodies.ids:
+            mistakes.append(Mistake(("forces", i, "body"), bodies.missing(item.body)))
+            continue
+        body = bodies.ids[item.body]
+        if model.body_weldid[body] == 0:
+            message = f"body {item.body!r} is fixed to the world; no force can move it"
+            mistakes.append(Mistake(("forces", i, "body"), message))
+        force, torque = (
+            constant_or_keyed(getattr(item, w), item.times, item.curve, ("forces", i, w), mistakes)
+            for w in ("force", "torque")
+        )
+        start = -np.inf if item.start is None else item.start
+        stop = np.inf if item.stop is None else item.stop
+        out.append(Wrench(body, force, torque, item.frame == "body", start, stop))
+    return tuple(out), mistakes
+
+
+def _drives(
+    scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, clip: Clip | None = None
+) -> tuple[NDArray[np.int8], dict[int, Callable[[Array], Array]], list[Mistake]]:
+    """What drives each actuator, as the scene says or as its joint's role suggests."""
+    actuators, mistakes = Names(model, "actuator"), []
+    drives = np.array([_suggested(scene, model, roles, found, i) for i in range(model.nu)], dtype=np.int8)
+    said: dict[int, str] = {}
+    for pattern, word in scene.actuators.items():
+        ids = actuators.match(pattern)
+        if not ids:
+            mistakes.append(Mistake(("actuators", pattern), actuators.missing(pattern)))
+        for i in ids:
+            drives[i] = Drive[word.upper()]
+            said[i] = pattern
+    servo: dict[int, Callable[[Array], Array]] = {}
+    for i in range(model.nu):
+        path = ("actuators", said[i]) if i in said else ("actuators",)
+        name = name_of(model, "actuator", i)
+        if drives[i] == Drive.OFF:
+            model.actuator_gainprm[i] = 0.0
+            model.actuator_biasprm[i] = 0.0
+        elif drives[i] == Drive.CONTROLLER:
+            if reason := why_not_controllable(model, i):
+                mistakes.append(Mistake(path, f"no controller can drive actuator {name!r}: {reason}"))
+        elif i in found.actuators:
+            curve = found.actuators[i]
+            servo[i] = lambda t, curve=curve: curve(t).q[:, 0]  # type: ignore[misc]
+        elif is_position_servo(model, i) and _on_joint(model, i):
+            if clip is not None:
+                servo[i] = _servo_along_keys(model, clip, i)
+        else:
+            message = f"actuator {name!r} is driven by keys but has none: add [[keys]] actuator = {name!r}"
+            mistakes.append(Mistake(path, message))
+    return drives, servo, mistakes
+
+
+def _suggested(scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, i: int) -> Drive:
+    if i in found.actuators:
+        return Drive.KEYS
+    if not _on_joint(model, i):
+        return Drive.OFF
+    if roles[model.actuator_trnid[i, 0]] != Role.TRACKED:
+        return Drive.OFF
+    servo = is_position_servo(model, i)
+    if why_not_controllable(model, i):
+        return Drive.KEYS if servo else Drive.OFF
+    return Drive.KEYS if servo and scene.controller is None else Drive.CONTROLLER
+
+
+def _on_joint(model: mujoco.MjModel, i: int) -> bool:
+    return bool(model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT) and model.jnt_type[
+        model.actuator_trnid[i, 0]
+    ] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _servo_along_keys(model: mujoco.MjModel, clip: Clip, i: int) -> Callable[[Array], Array]:
+    """Control of a position servo that follows its joint's keys: ctrl = gear q."""
+    column = int(model.jnt_qposadr[model.actuator_trnid[i, 0]])
+    gear = float(model.actuator_gear[i, 0])
+    return lambda t: np.asarray(gear * clip.evaluate(t).q[:, column])
+
+
+def _clip(
+    model: mujoco.MjModel, found: Curves, roles: NDArray[np.int8], q0: Array
+) -> tuple[Clip, tuple[str, ...]]:
+    """The clip of all joints with keys, and the passive joints that an equality ties to keyed ones: these
+    become keyed."""
+    clip = Clip(model, {name_of(model, "joint", j): t for j, t in found.tracks.items()}, q0)
+    tied = clip.with_coupled()
+    coupled = []
+    for name in tied.tracks.keys() - clip.tracks.keys():
+        joint = model.joint(name).id
+        others = [
+            int(b if a == joint else a)
+            for a, b, kind in zip(model.eq_obj1id, model.eq_obj2id, model.eq_type, strict=True)
+            if kind == mujoco.mjtEq.mjEQ_JOINT and joint in (a, b)
+        ]
+        if roles[joint] == Role.PASSIVE and any(roles[o] == Role.KEYED for o in others if o >= 0):
+            roles[joint] = Role.KEYED
+            coupled.append(name)
+    return tied, tuple(sorted(coupled))
+
+
+def _switches(scene: Scene, model: mujoco.MjModel) -> None:
+    physics, disable = scene.physics, mujoco.mjtDisableBit
+    if physics.contacts == "none":
+        model.opt.disableflags |= int(disable.mjDSBL_CONTACT)
+    if not physics.limits:
+        model.opt.disableflags |= int(disable.mjDSBL_LIMIT)
+    if not physics.friction:
+        model.opt.disableflags |= int(disable.mjDSBL_FRICTIONLOSS)
+    if physics.gravity is False:
+        model.opt.disableflags |= int(disable.mjDSBL_GRAVITY)
+    elif physics.gravity is not True:
+        model.opt.gravity[:] = physics.gravity
+
+
+def _silence_equalities(
+    model: mujoco.MjModel, prescribed: NDArray[np.bool_], roles: NDArray[np.int8]
+) -> None:
+    """Equalities between things that all move as keyed cannot act; the keys already decide."""
+    for e in range(model.neq):
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if model.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT:
+            if all(j < 0 or roles[j] == Role.KEYED for j in ends):
+                model.eq_active0[e] = 0
+        elif model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_BODY and all(prescribed[b] for b in ends):
+            model.eq_active0[e] = 0
+
+
+def _film_names(scene: Scene, model: mujoco.MjModel) -> list[Mistake]:
+    mistakes, bodies, cameras = [], Names(model, "body"), Names(model, "camera")
+    for i, camera in enumerate(scene.cameras):
+        if camera.body is not None and camera.body not in bodies.ids:
+            mistakes.append(Mistake(("cameras", i, "body"), bodies.missing(camera.body)))
+        if camera.kind == "model" and camera.name not in cameras.ids:
+            mistakes.append(Mistake(("cameras", i, "name"), cameras.missing(camera.name)))
+    known = {c.name for c in scene.cameras} | set(cameras.ids)
+    if scene.film.camera is not None and scene.film.camera not in known:
+        listing = ", ".join(sorted(known)) or "none"
+        mistakes.append(Mistake(("film", "camera"), f"no camera {scene.film.camera!r}; there is: {listing}"))
+    return mistakes
