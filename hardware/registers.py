@@ -1,7 +1,7 @@
 """Control tables of Dynamixel servos as frozen rows, with conversion between raw counts and SI units.
 
-The rows themselves are data in `tables/`, with the manual page of every model. Position zero is the middle of the
-turn (2048 counts), as in the `.model` files of the official SDK.
+The rows themselves are data in `tables/`, with the manual page of every model. Position zero is the middle of
+the turn (2048 counts), as in the `.model` files of the official SDK.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Register:
         address: First byte.
         size: Bytes, 1, 2 or 4; little endian.
         signed: Two's complement.
-        unit: SI unit of the converted value: rad, rad/s, rad/s^2, A, V, V/s, s, degC, or "" (a count or ratio).
+        unit: Of the converted value: rad, rad/s, rad/s^2, A, V, V/s, s, degC, or "" (a count or ratio).
         scale: Unit per count.
         access: R or RW.
         default: Factory value in counts; None where the manual states none.
@@ -191,7 +191,7 @@ def model_names() -> tuple[str, ...]:
 
 @cache
 def control_table(model: str | int) -> ControlTable:
-    """Control table by model name (`xm430-w350`, any case) or model number (1020); RegisterError lists what exists."""
+    """Control table by model name (`xm430-w350`, any case) or number (1020); RegisterError lists what exists."""
     from .tables.models import MODELS, build
 
     if isinstance(model, int):

@@ -1,8 +1,8 @@
 """What differs between the servo models: factory values, ranges and units, each with its manual page.
 
-Values were read from the sources of the ROBOTIS e-manual (github.com/ROBOTIS-GIT/emanual, docs/en/dxl/), which are
-the pages cited. `velocity=None`: no version of the page with the present velocity limit was at hand (older ones state
-higher limits, from before the limits were revised), so the default is left open.
+Values were read from the sources of the ROBOTIS e-manual (github.com/ROBOTIS-GIT/emanual, docs/en/dxl/), which
+are the pages cited. `velocity=None`: no version of the page with the present velocity limit was at hand (older ones
+state higher limits, from before the limits were revised), so the default is left open.
 """
 
 from __future__ import annotations
@@ -104,8 +104,12 @@ MODELS: Mapping[str, Model] = MappingProxyType(
         "xh430-v350": _x(1040, "xh430-v350", voltage=(110, 300), velocity=135, current=(689, 1.34 * _mA)),
         "xh430-v210": _x(1050, "xh430-v210", voltage=(110, 300), velocity=None, current=(689, 1.34 * _mA)),
         "mx-28": _x(30, "mx-28-2", velocity=230, position_gains=(0, 0, 850), mx=True),
-        "mx-64": _x(311, "mx-64-2", velocity=None, position_gains=(0, 0, 850), current=(1941, 3.36 * _mA), mx=True),
-        "mx-106": _x(321, "mx-106-2", velocity=None, position_gains=(0, 0, 850), current=(2047, 3.36 * _mA), mx=True),
+        "mx-64": _x(
+            311, "mx-64-2", velocity=None, position_gains=(0, 0, 850), current=(1941, 3.36 * _mA), mx=True
+        ),
+        "mx-106": _x(
+            321, "mx-106-2", velocity=None, position_gains=(0, 0, 850), current=(2047, 3.36 * _mA), mx=True
+        ),
     }
 )  # fmt: skip
 

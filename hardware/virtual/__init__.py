@@ -1,0 +1,26 @@
+"""Virtual servos and buses: the whole path to the hardware without hardware."""
+
+from .bus import Ledger, Timing, VirtualBus
+from .faults import NO_FAULTS, CablePull, FaultPlan, ServoFault, WireFault
+from .motor import MOTORS, Gear, Motor, Plant, joints
+from .port import MemoryPort
+from .servo import Quirks, VirtualServo
+
+__all__ = [
+    "MOTORS",
+    "NO_FAULTS",
+    "CablePull",
+    "FaultPlan",
+    "Gear",
+    "Ledger",
+    "MemoryPort",
+    "Motor",
+    "Plant",
+    "Quirks",
+    "ServoFault",
+    "Timing",
+    "VirtualBus",
+    "VirtualServo",
+    "WireFault",
+    "joints",
+]

@@ -1,0 +1,551 @@
+"""A virtual servo: control table, instructions and protection around a drive.
+
+Behaviour follows the e-manual pages of the X series; where they are silent or the notes of users disagree, the choice
+is an argument of `Quirks` and set to the harsher case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, pi
+
+from ..errors import HardwareError
+from ..packets import ALERT, BROADCAST, Instruction, Packet, StatusError, status
+from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register, control_table
+from ..tables.rows import ACCELERATION, CENTRE, POSITION, PWM, VELOCITY
+from . import drive as d
+from .drive import PERIOD, Drive, Settings, position_gains, velocity_gains, within_one_turn
+from .memory import Memory
+from .motor import MOTORS, Gear, Motor, Plant
+
+VOLTAGE, OVERHEATING, ENCODER, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0x20
+GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+GOALS_OF_MODE = {0: GOALS[1], 1: GOALS[2], 3: GOALS[3], 4: GOALS[3], 5: GOALS[3], 16: GOALS[0]}
+SLOW = 10  # control periods between updates of voltage, temperature and protection
+
+
+@dataclass(frozen=True)
+class Quirks:
+    """What the manual leaves open.
+
+    Args:
+        goal_survives_torque_off: At torque-on the servo goes to the old goal (True, the dangerous case) or holds.
+        goal_limit_error: Answer to a goal position outside of the position limits.
+        boot_time: Silence after a reboot [s].
+        overload_ratio, overload_time: Overload is this part of the stall current for this long [s].
+    """
+
+    goal_survives_torque_off: bool = True
+    goal_limit_error: StatusError = StatusError.DATA_LIMIT
+    boot_time: float = 0.1
+    overload_ratio: float = 0.8
+    overload_time: float = 1.0
+
+
+class VirtualServo:
+    """One servo on a virtual bus.
+
+    Args:
+        model: Name or number of a model that has a control table.
+        id: 0 to 252.
+        baud: Bit rate [bit/s]; factory value 57,600.
+        position: Shaft angle at power-on [rad], zero in the middle of the turn.
+        plant: What the shaft drives; a bare gear when None.
+        motor: Constants; those of the model when None.
+        firmware: Version; the first that answers fast reads when None.
+        supply: Voltage [V]; the recommended one when None.
+        ambient: Temperature [degC].
+        quirks: What the manual leaves open.
+        registers: Factory values to replace, in counts, by name (EEPROM or RAM).
+    """
+
+    def __init__(
+        self,
+        model: str | int,
+        id: int = 1,
+        *,
+        baud: int = 57_600,
+        position: float = 0.0,
+        plant: Plant | None = None,
+        motor: Motor | None = None,
+        firmware: int | None = None,
+        supply: float | None = None,
+        ambient: float = 25.0,
+        quirks: Quirks = Quirks(),  # noqa: B008 - frozen
+        registers: dict[str, int] | None = None,
+    ) -> None:
+        self.table: ControlTable = control_table(model)
+        self.quirks = quirks
+        motor = motor or MOTORS[self.table.model]
+        plant = plant or Gear(motor.inertia, motor.coulomb, position=position)
+        self.drive = Drive(motor, plant, supply=supply or motor.voltage, ambient=ambient)
+        self.memory = Memory(self.table)
+        self.time = 0.0
+        self.dead = False
+        self._latched = 0  # hardware error bits
+        self._overload = 0.0
+        self._periods = 0
+        self._boot_until = -inf
+        self._fed = 0.0
+        self._registered: tuple[int, bytes] | None = None
+        self._backup: bytes | None = None
+        self._fresh = -1.0
+        self._firmware = firmware or self.table.fast_read_firmware or 45
+        self._factory()
+        self.memory.put("id", id)
+        self.memory.put("baud_rate", self._baud_value(baud))
+        for name, raw in (registers or {}).items():
+            self.memory.put(self.table[name].name, raw)
+        self._power_on()
+
+    # State that a bus and a test look at.
+
+    @property
+    def id(self) -> int:
+        """ID, register 7."""
+        return self.memory.get("id")
+
+    @property
+    def baud(self) -> int:
+        """Bit rate [bit/s]."""
+        return self.table.bauds[self.memory.get("baud_rate")]
+
+    @property
+    def return_delay(self) -> float:
+        """Time before a reply [s]."""
+        return self.memory.get("return_delay_time") * 2e-6
+
+    @property
+    def awake(self) -> bool:
+        """Whether the servo is powered, alive and done booting."""
+        return not self.dead and self.time >= self._boot_until
+
+    def get(self, name: str) -> int:
+        """Signed count in a register as the host would read it now; RegisterError for an unknown name."""
+        row = self.table[name]
+        self._refresh()
+        return self.memory.get(row.name)
+
+    def si(self, name: str) -> float:
+        """Register in SI units."""
+        return self.table[name].to_si(self.get(name))
+
+    def answers_to(self, id: int) -> bool:
+        """Whether a packet with this ID is executed here (own ID, shadow ID or broadcast)."""
+        return id in (self.id, BROADCAST) or self._is_shadow(id)
+
+    def _is_shadow(self, id: int) -> bool:
+        return id == self.memory.get("secondary_id") <= 252 and id != self.id
+
+    @property
+    def reads_fast(self) -> bool:
+        """Whether the firmware answers fast sync and bulk reads."""
+        return self._firmware >= (self.table.fast_read_firmware or 45)
+
+    def revive(self) -> None:
+        """Power comes back after a dead time."""
+        self.dead = False
+        self._reboot()
+
+    # Time.
+
+    def step(self) -> None:
+        """Advance one control period of 1 ms."""
+        self.time += PERIOD
+        if self.dead:
+            self.drive.settings.torque = False
+        self.drive.step()
+        self._periods += 1
+        if self._periods % SLOW == 0:
+            self.drive.warm(SLOW * PERIOD)
+            self._protect(SLOW * PERIOD)
+        watchdog = self._watchdog_period
+        if watchdog and self.drive.settings.torque and self.time - self._fed > watchdog:
+            self.trip_watchdog()
+
+    def feed(self) -> None:
+        """The servo heard an instruction packet: its bus watchdog starts again."""
+        self._fed = self.time
+
+    def trip_watchdog(self) -> None:
+        """Stop as the bus watchdog does: motion off, profiles 0, goals locked."""
+        self.memory.put("bus_watchdog", -1)
+        self.memory.put("profile_velocity", 0)
+        self.memory.put("profile_acceleration", 0)
+        self.memory.put("goal_velocity", 0)
+        self._apply_settings()
+        self.drive.halt()
+
+    def fail(self, bit: int) -> None:
+        """Latch a hardware error; one that the shutdown register selects takes the torque away."""
+        self._latched |= bit
+        self.memory.put("hardware_error_status", self._latched)
+        if self._latched & self.memory.get("shutdown"):
+            self.memory.put("torque_enable", 0)
+            self._apply_settings()
+
+    def _protect(self, dt: float) -> None:
+        drive, memory = self.drive, self.memory
+        if drive.temperature > memory.get("temperature_limit"):
+            self.fail(OVERHEATING)
+        volts = round(drive.voltage * 10)
+        if not memory.get("min_voltage_limit") <= volts <= memory.get("max_voltage_limit"):
+            self.fail(VOLTAGE)
+        heavy = abs(drive.current) >= self.quirks.overload_ratio * drive.motor.stall_current
+        self._overload = self._overload + dt if heavy else 0.0
+        if self._overload > self.quirks.overload_time:
+            self.fail(OVERLOAD)
+
+    # Power and factory values.
+
+    def _baud_value(self, baud: int) -> int:
+        for value, rate in self.table.bauds.items():
+            if rate == baud:
+                return value
+        known = ", ".join(f"{b:,}" for b in self.table.bauds.values())
+        raise HardwareError(f"{self.table.model} has no bit rate {baud:,}; it has: {known}")
+
+    def _factory(self) -> None:
+        """Factory values of EEPROM and RAM; a velocity limit without a source becomes the no-load speed."""
+        for row in self.table.registers:
+            self.memory.put(row.name, row.default or 0)
+        if self.table["velocity_limit"].default is None:
+            self.memory.put("velocity_limit", round(self.drive.motor.no_load_speed / VELOCITY))
+        self.memory.put("firmware_version", self._firmware)
+
+    def _power_on(self) -> None:
+        """RAM as after power-on: turns are lost, goals are where the servo is."""
+        memory = self.memory
+        for row in self.table.registers:
+            if row.address >= FIRST_RAM_ADDRESS:
+                memory.put(row.name, row.default or 0)
+        if "backup_ready" in self.table:
+            memory.put("backup_ready", int(self._backup is not None))
+        self._latched, self._registered, self._overload = 0, None, 0.0
+        self.drive.halted = False
+        self._apply_settings()
+        self._reset_turns()
+        self._default_goals()
+        if "startup_configuration" in self.table and memory.get("startup_configuration") & 1:
+            self._torque(True)
+        self._fresh = -1.0
+
+    def _default_goals(self) -> None:
+        """Goals after power-on or a change of mode: nothing moves, limits are open."""
+        memory, mode = self.memory, self.memory.get("operating_mode")
+        memory.put("goal_pwm", 0 if mode == d.PWM_MODE else memory.get("pwm_limit"))
+        if self.table.has_current:
+            memory.put("goal_current", 0 if mode == d.CURRENT_MODE else memory.get("current_limit"))
+        memory.put("goal_velocity", 0)
+        memory.put("goal_position", self._counts(self.drive.position))
+        self._apply_settings()
+        self.drive.hold()
+
+    def _reboot(self) -> None:
+        self._power_on()
+        self._boot_until = self.time + self.quirks.boot_time
+
+    def _reset_turns(self) -> None:
+        """Report the shaft within one turn, homing offset added."""
+        offset = self.memory.get("homing_offset")
+        if self.memory.get("operating_mode") == d.POSITION_MODE and abs(offset) > 1024:
+            offset = 0
+        sign = -1.0 if self.drive.settings.reverse else 1.0
+        self.drive.place(within_one_turn(sign * self.drive.shaft) + offset * POSITION)
+        self._offset = offset
+
+    # From registers to the drive.
+
+    def _apply_settings(self) -> None:
+        get = self.memory.get
+        s = self.drive.settings
+        mode, drive_mode = get("operating_mode"), get("drive_mode")
+        timed = bool(drive_mode & 4)
+        watchdog = get("bus_watchdog")
+        self._watchdog_period = watchdog * 0.02 if watchdog > 0 else 0.0
+        speed, acceleration = get("profile_velocity"), get("profile_acceleration")
+        self.drive.settings = Settings(
+            mode=mode,
+            torque=bool(get("torque_enable")) and not self.dead,
+            reverse=s.reverse,
+            time_based=timed,
+            position_gains=position_gains(
+                get("position_p_gain"), get("position_i_gain"), get("position_d_gain")
+            ),
+            velocity_gains=velocity_gains(get("velocity_p_gain"), get("velocity_i_gain")),
+            pwm_goal=get("goal_pwm") * PWM,
+            current_goal=get("goal_current") * self.table["goal_current"].scale
+            if self.table.has_current
+            else inf,
+            velocity_goal=get("goal_velocity") * VELOCITY,
+            position_goal=(get("goal_position") - CENTRE) * POSITION,
+            profile_velocity=speed * 1e-3 if timed else speed * VELOCITY,
+            profile_acceleration=acceleration * 1e-3 if timed else acceleration * ACCELERATION,
+        )
+
+    def _torque(self, on: bool) -> None:
+        if on and self._latched & self.memory.get("shutdown"):
+            return  # only a reboot recovers
+        was = self.drive.settings.torque
+        self.memory.put("torque_enable", int(on))
+        if on and not was:
+            if self.memory.get("operating_mode") == d.POSITION_MODE:
+                self._reset_turns()
+            self._fed = self.time
+            self.drive.hold()
+            if not self.quirks.goal_survives_torque_off:
+                self.memory.put("goal_position", self._counts(self.drive.position))
+            self._apply_settings()
+            if not self.drive.halted:
+                self.drive.plan()
+        self._apply_settings()
+
+    def _counts(self, angle: float) -> int:
+        return round(angle / POSITION) + CENTRE
+
+    # Instructions.
+
+    def execute(self, packet: Packet) -> Packet | None:
+        """Carry out an instruction for this servo; the reply, or None when there is none.
+
+        Sync and bulk instructions, whose replies form a chain, are the bus's; it calls `write` and `reply_to_read`.
+        """
+        silent = packet.id != self.id
+        shadow = self._is_shadow(packet.id)
+        own = self.id
+        error, data = self._do(packet, shadow)
+        level = self.memory.get("status_return_level")
+        if packet.instruction == Instruction.PING:
+            return None if shadow else status(own, self._error_byte(StatusError.NONE), data)
+        wanted = level == 2 or (level == 1 and packet.instruction == Instruction.READ)
+        return status(own, self._error_byte(error), data) if wanted and not silent else None
+
+    def _do(self, packet: Packet, shadow: bool) -> tuple[StatusError, bytes]:
+        params = packet.params
+        none = StatusError.NONE
+        match packet.instruction:
+            case Instruction.PING:
+                return none, bytes(self.memory.bytes[0:2]) + bytes((self._firmware,))
+            case Instruction.READ if len(params) == 4:
+                return self.read(_word(params, 0), _word(params, 2))
+            case Instruction.WRITE if len(params) >= 2:
+                return self.write(_word(params, 0), params[2:], shadow=shadow), b""
+            case Instruction.REG_WRITE if len(params) >= 2:
+                return self._register(_word(params, 0), params[2:]), b""
+            case Instruction.ACTION:
+                return self._action(), b""
+            case Instruction.REBOOT:
+                self._reboot()
+                return none, b""
+            case Instruction.CLEAR:
+                return self._clear(params), b""
+            case Instruction.FACTORY_RESET if len(params) == 1:
+                return self._factory_reset(params[0], packet.id == BROADCAST), b""
+            case Instruction.BACKUP:
+                return self._back_up(params), b""
+        return StatusError.INSTRUCTION, b""
+
+    def _error_byte(self, error: StatusError) -> int:
+        return error | (ALERT if self._latched else 0)
+
+    def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
+        """Bytes as the host reads them."""
+        self._refresh()
+        return self.memory.read(address, length)
+
+    def reply_to_read(self, address: int, length: int) -> tuple[int, bytes] | None:
+        """(Error byte, data) for a link of a sync or bulk read, or None when replies are switched off."""
+        if self.memory.get("status_return_level") == 0:
+            return None
+        error, data = self.read(address, length)
+        return self._error_byte(error), data
+
+    def write(self, address: int, data: bytes, *, shadow: bool = False) -> StatusError:
+        """Write as the host does: all of the registers or none; the error that it is answered."""
+        error, values = self.memory.parse(address, data)
+        if error:
+            return error
+        for row, raw in values.items():
+            if error := self._refusal(row, raw, shadow):
+                return error
+        for row, raw in values.items():
+            self._set(row, raw)
+        return StatusError.NONE
+
+    def _refusal(self, row: Register, raw: int, shadow: bool) -> StatusError:
+        if row.area == "EEPROM" and (self.drive.settings.torque or shadow):
+            return StatusError.ACCESS
+        if row.name in GOALS and self.memory.get("bus_watchdog") == -1:
+            return StatusError.DATA_RANGE
+        if row.name == "operating_mode" and raw not in self.table.modes:
+            return StatusError.DATA_RANGE
+        if row.name == "goal_position":
+            mode = self.memory.get("operating_mode")
+            if mode == d.POSITION_MODE:
+                low, high = self.memory.get("min_position_limit"), self.memory.get("max_position_limit")
+                return StatusError.NONE if low <= raw <= high else self.quirks.goal_limit_error
+            if abs(raw) > 1_048_575:
+                return StatusError.DATA_RANGE
+        return self.memory.check(row, raw)
+
+    def _set(self, row: Register, raw: int) -> None:
+        """Store a value and do what follows from it."""
+        name = row.name
+        if name == "torque_enable":
+            self._torque(bool(raw))
+            return
+        tripped = name == "bus_watchdog" and self.memory.get(name) == -1
+        self.memory.put(name, raw)
+        if name == "bus_watchdog":
+            self._fed = self.time
+            self._apply_settings()
+            if tripped and raw == 0:
+                self._resume()
+        elif name == "operating_mode":
+            self._change_mode()
+        elif name in ("homing_offset", "drive_mode"):
+            self._change_frame()
+        elif name in GOALS:
+            self._new_goal(name)
+        else:
+            self._apply_settings()
+
+    def _resume(self) -> None:
+        self.memory.put("goal_position", self._counts(self.drive.position))
+        self._apply_settings()
+        self.drive.resume()
+
+    def _change_mode(self) -> None:
+        """Profiles and gains fall back to their defaults (manual: Operating Mode)."""
+        for row in self.table.registers:
+            if row.name.endswith("_gain") or row.name.startswith("profile_"):
+                self.memory.put(row.name, row.default or 0)
+        self._apply_settings()
+        if self.memory.get("operating_mode") == d.POSITION_MODE:
+            self._reset_turns()
+        self._default_goals()
+
+    def _change_frame(self) -> None:
+        """Homing offset or reverse mode: the same shaft angle reads differently, turns are kept."""
+        drive = self.drive
+        actual = drive.position - self._offset * POSITION
+        offset = self.memory.get("homing_offset")
+        if self.memory.get("operating_mode") == d.POSITION_MODE and abs(offset) > 1024:
+            offset = 0
+        reverse = bool(self.memory.get("drive_mode") & 1)
+        if reverse != drive.settings.reverse:
+            drive.settings.reverse = reverse
+            actual = -actual
+        drive.place(actual + offset * POSITION)
+        self._offset = offset
+        self._apply_settings()
+        drive.hold()
+
+    def _new_goal(self, name: str) -> None:
+        active = GOALS_OF_MODE[self.memory.get("operating_mode")]
+        if name == active and self.memory.get("drive_mode") & 8 and not self.drive.settings.torque:
+            self._torque(True)
+        self._apply_settings()
+        if name == active and self.drive.settings.torque:
+            self.drive.plan()
+
+    def _register(self, address: int, data: bytes) -> StatusError:
+        error, _ = self.memory.parse(address, data)
+        if not error:
+            self._registered = (address, data)
+            self.memory.put("registered_instruction", 1)
+        return error
+
+    def _action(self) -> StatusError:
+        if self._registered is None:
+            return StatusError.INSTRUCTION
+        address, data = self._registered
+        self._registered = None
+        self.memory.put("registered_instruction", 0)
+        return self.write(address, data)
+
+    def _clear(self, params: bytes) -> StatusError:
+        """Clear multi-turn information; the servo must stand still."""
+        if params != b"\x01\x44\x58\x4c\x22":
+            return StatusError.DATA_RANGE
+        if self.get("moving"):
+            return StatusError.RESULT_FAIL
+        self._reset_turns()
+        self.memory.put("goal_position", self._counts(self.drive.position))
+        self._apply_settings()
+        self.drive.hold()
+        return StatusError.NONE
+
+    def _factory_reset(self, option: int, broadcast: bool) -> StatusError:
+        if option not in (0xFF, 0x01, 0x02) or (option == 0xFF and broadcast):
+            return StatusError.DATA_RANGE
+        keep = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}[option]
+        kept = {name: self.memory.get(name) for name in keep}
+        self._factory()
+        for name, raw in kept.items():
+            self.memory.put(name, raw)
+        self.drive.settings.reverse = False
+        self._reboot()
+        return StatusError.NONE
+
+    def _back_up(self, params: bytes) -> StatusError:
+        if len(params) != 5 or params[1:] != b"CTRL" or params[0] not in (1, 2):
+            return StatusError.DATA_RANGE
+        if self.drive.settings.torque or (params[0] == 2 and self._backup is None):
+            return StatusError.RESULT_FAIL
+        if params[0] == 1:
+            self._backup = self.memory.eeprom()
+            if "backup_ready" in self.table:
+                self.memory.put("backup_ready", 1)
+        else:
+            assert self._backup is not None
+            self.memory.bytes[:FIRST_RAM_ADDRESS] = self._backup
+            self._reboot()
+        return StatusError.NONE
+
+    # From the drive to registers.
+
+    def _refresh(self) -> None:
+        """Bring the read-only registers up to date with the drive."""
+        if self._fresh == self.time:
+            return
+        self._fresh = self.time
+        drive, put = self.drive, self.memory.put
+        position, velocity = drive.position, drive.velocity
+        target, target_velocity = drive.target
+        counts = self._counts(position)
+        put("realtime_tick", round(self.time * 1000) % 32_768)
+        put("present_position", counts)
+        put("present_velocity", round(velocity / VELOCITY))
+        put("position_trajectory", self._counts(target))
+        put("velocity_trajectory", round(target_velocity / VELOCITY))
+        put("present_pwm", round(drive.pwm / PWM))
+        put("present_input_voltage", round(drive.voltage * 10))
+        put("present_temperature", round(drive.temperature))
+        if self.table.has_current:
+            put("present_current", round(drive.current / self.table["present_current"].scale))
+        else:
+            put("present_load", round(1000 * drive.current / drive.motor.stall_current))
+        self._refresh_moving(counts, velocity)
+
+    def _refresh_moving(self, counts: int, velocity: float) -> None:
+        drive, memory = self.drive, self.memory
+        s = drive.settings
+        threshold = memory.get("moving_threshold")
+        ongoing = s.torque and s.mode in d.POSITION_MODES and drive.elapsed < drive.trajectory.duration
+        memory.put("moving", int(ongoing or abs(velocity) > threshold * VELOCITY))
+        value = 0
+        if s.mode in d.POSITION_MODES and s.torque:
+            goal = memory.get("goal_position")
+            value = drive.trajectory.kind | (0x02 if ongoing else 0)
+            value |= 0x01 if abs(goal - counts) <= IN_POSITION else 0
+            value |= 0x08 if abs(drive.target[0] - drive.position) > FOLLOWING_ERROR else 0
+        memory.put("moving_status", value)
+
+
+IN_POSITION = 20  # counts: the threshold that the SDK's examples call arrived
+FOLLOWING_ERROR = pi / 18  # rad
+
+
+def _word(data: bytes, place: int) -> int:
+    return data[place] | data[place + 1] << 8
