@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+EPS = float(np.finfo(np.float64).eps)
 # Coefficients are rounded to doubles, so that sums of s of them agree to a few units in the last place.
-ROUNDING = 64 * np.finfo(np.float64).eps
+ROUNDING = 64 * EPS
 
 
 def frozen(values: ArrayLike) -> Array:
