@@ -1,0 +1,253 @@
+"""Scalar expression graph, hash-consed and folded as it grows.
+
+Every expression is built once: equal operands give the same node, zeros and ones vanish, signs move
+outward (so that additions absorb them) and divisions become shared reciprocals. Ordinary numbers stay
+Python floats until they meet a node, so that formulas written with plain operators run on numbers, on
+nodes, or on both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, TypeAlias
+
+CONST, INPUT, ADD, SUB, MUL, NEG, INV, SQRT, SIN, COS, MIN, MAX, ABS, LESS, ATAN2 = range(15)
+OP_NAMES = "const input add sub mul neg inv sqrt sin cos min max abs less atan2".split()
+BINARY = frozenset((ADD, SUB, MUL, MIN, MAX, LESS, ATAN2))
+_COMMUTATIVE = frozenset((ADD, MUL, MIN, MAX))
+
+
+class Node:
+    """One value of a graph; `a`, `b` are operands, `value` a constant or an input's (argument, index)."""
+
+    __slots__ = ("a", "b", "graph", "id", "op", "value")
+    a: Any
+    b: Any
+    value: Any
+
+    def __init__(self, graph: Graph, id: int, op: int, a: Node | None, b: Node | None, value: object):
+        self.graph, self.id, self.op, self.a, self.b, self.value = graph, id, op, a, b, value
+
+    def __add__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, Node):
+            return self if other == 0.0 else self.graph.add(self, self.graph.const(other))
+        return self.graph.add(self, other)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Scalar:
+        return self.graph.neg(self)
+
+    def __sub__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, Node):
+            return self if other == 0.0 else self.graph.sub(self, self.graph.const(other))
+        return self.graph.sub(self, other)
+
+    def __rsub__(self, other: float) -> Scalar:
+        return self.graph.neg(self) if other == 0.0 else self.graph.sub(self.graph.const(other), self)
+
+    def __mul__(self, other: Scalar) -> Scalar:
+        if isinstance(other, Node):
+            return self.graph.mul(self, other)
+        if other == 0.0:
+            return 0.0
+        if other == 1.0:
+            return self
+        if other < 0.0:
+            return self.graph.neg(self * -other)
+        return self.graph.mul(self, self.graph.const(other))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Scalar) -> Scalar:
+        return self * (self.graph.inv(other) if isinstance(other, Node) else 1.0 / other)
+
+    def __rtruediv__(self, other: float) -> Scalar:
+        return self.graph.inv(self) * other
+
+    def __repr__(self) -> str:
+        return f"<{OP_NAMES[self.op]} {self.id}>"
+
+
+Scalar: TypeAlias = Node | float
+
+
+class Graph:
+    """Owner of nodes in order of creation, which is a topological order."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._known: dict[tuple[object, ...], Node] = {}
+
+    def inputs(self, name: str, size: int) -> list[Node]:
+        """The `size` scalars of argument `name`."""
+        return [self._leaf(INPUT, (name, i)) for i in range(size)]
+
+    def const(self, value: float) -> Node:
+        """Node of a number."""
+        return self._leaf(CONST, float(value))
+
+    def node(self, value: Scalar) -> Node:
+        """`value` as a node."""
+        return value if isinstance(value, Node) else self.const(value)
+
+    def _leaf(self, op: int, value: object) -> Node:
+        found = self._known.get((op, value))
+        if found is None:
+            found = Node(self, len(self.nodes), op, None, None, value)
+            self.nodes.append(found)
+            self._known[op, value] = found
+        return found
+
+    def _new(self, op: int, a: Node, b: Node | None = None) -> Node:
+        if b is None:
+            key: tuple[object, ...] = (op, a.id)
+        else:
+            if op in _COMMUTATIVE and b.id < a.id:
+                a, b = b, a
+            key = (op, a.id, b.id)
+        found = self._known.get(key)
+        if found is None:
+            found = Node(self, len(self.nodes), op, a, b, None)
+            self.nodes.append(found)
+            self._known[key] = found
+        return found
+
+    def add(self, a: Node, b: Node) -> Scalar:
+        """a + b."""
+        if a.op == NEG:
+            return self.neg(self._new(ADD, a.a, b.a)) if b.op == NEG else self.sub(b, a.a)
+        if b.op == NEG:
+            return self.sub(a, b.a)
+        if a.op == CONST and b.op == CONST:
+            return float(a.value + b.value)
+        return self._new(ADD, a, b)
+
+    def sub(self, a: Node, b: Node) -> Scalar:
+        """a - b."""
+        if a is b:
+            return 0.0
+        if b.op == NEG:
+            return self.add(a, b.a)
+        if a.op == NEG:
+            return self.neg(self._new(ADD, a.a, b))
+        if a.op == CONST and b.op == CONST:
+            return float(a.value - b.value)
+        mirrored = self._known.get((SUB, b.id, a.id))
+        return self.neg(mirrored) if mirrored is not None else self._new(SUB, a, b)
+
+    def mul(self, a: Node, b: Node) -> Scalar:
+        """a b."""
+        negative = (a.op == NEG) != (b.op == NEG)
+        a, b = (a.a if a.op == NEG else a), (b.a if b.op == NEG else b)
+        if b.op == CONST:
+            a, b = b, a
+        if a.op == CONST:
+            if b.op == CONST:
+                product: Scalar = float(a.value * b.value)
+            elif b.op == MUL and b.a.op == CONST:
+                product = b.b * (a.value * b.a.value)
+            elif b.op == MUL and b.b.op == CONST:
+                product = b.a * (a.value * b.b.value)
+            else:
+                product = self._new(MUL, a, b)
+        else:
+            product = self._new(MUL, a, b)
+        return -product if negative else product
+
+    def neg(self, a: Node) -> Scalar:
+        """-a."""
+        if a.op == NEG:
+            return a.a
+        return -float(a.value) if a.op == CONST else self._new(NEG, a)
+
+    def inv(self, a: Node) -> Scalar:
+        """1 / a."""
+        if a.op == NEG:
+            return self.neg(self._new(INV, a.a))
+        if a.op == INV:
+            return a.a
+        return 1.0 / a.value if a.op == CONST else self._new(INV, a)
+
+    def unary(self, op: int, a: Node) -> Scalar:
+        """Square root, sine, cosine or absolute value."""
+        if a.op == NEG:
+            if op == SIN:
+                return self.neg(self._new(SIN, a.a))
+            if op in (COS, ABS):
+                a = a.a
+        return self._new(op, a)
+
+    def binary(self, op: int, a: Scalar, b: Scalar) -> Node:
+        """Minimum, maximum, `a < b` as 1 or 0, or atan2(a, b), as a node."""
+        return self._new(op, self.node(a), self.node(b))
+
+
+def sqrt(x: Scalar) -> Scalar:
+    """Square root."""
+    return x.graph.unary(SQRT, x) if isinstance(x, Node) else math.sqrt(x)
+
+
+def sin(x: Scalar) -> Scalar:
+    """Sine."""
+    return x.graph.unary(SIN, x) if isinstance(x, Node) else math.sin(x)
+
+
+def cos(x: Scalar) -> Scalar:
+    """Cosine."""
+    return x.graph.unary(COS, x) if isinstance(x, Node) else math.cos(x)
+
+
+def absolute(x: Scalar) -> Scalar:
+    """Absolute value."""
+    return x.graph.unary(ABS, x) if isinstance(x, Node) else abs(x)
+
+
+def _owner(*xs: Scalar) -> Graph | None:
+    return next((x.graph for x in xs if isinstance(x, Node)), None)
+
+
+def minimum(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller of two."""
+    graph = _owner(a, b)
+    return graph.binary(MIN, a, b) if graph else min(a, b)
+
+
+def maximum(a: Scalar, b: Scalar) -> Scalar:
+    """The larger of two."""
+    graph = _owner(a, b)
+    return graph.binary(MAX, a, b) if graph else max(a, b)
+
+
+def less(a: Scalar, b: Scalar) -> Scalar:
+    """1 where a < b, else 0; its derivative is taken as zero."""
+    graph = _owner(a, b)
+    return graph.binary(LESS, a, b) if graph else float(a < b)
+
+
+def atan2(y: Scalar, x: Scalar) -> Scalar:
+    """Angle of the point (x, y)."""
+    graph = _owner(y, x)
+    return graph.binary(ATAN2, y, x) if graph else math.atan2(y, x)
+
+
+def clip(x: Scalar, low: float, high: float) -> Scalar:
+    """`x` limited to [low, high]."""
+    return minimum(maximum(x, low), high)
+
+
+def reachable(outputs: Iterable[Scalar]) -> list[Node]:
+    """The nodes that `outputs` need, in topological order."""
+    needed: dict[int, Node] = {}
+    stack = [x for x in outputs if isinstance(x, Node)]
+    while stack:
+        node = stack.pop()
+        if node.id in needed:
+            continue
+        needed[node.id] = node
+        if node.a is not None:
+            stack.append(node.a)
+            if node.b is not None:
+                stack.append(node.b)
+    return [needed[i] for i in sorted(needed)]

@@ -1,0 +1,95 @@
+"""LLVM IR text to machine code in this process, and back from object files."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+
+@cache
+def host() -> tuple[str, str, str]:
+    """Target triple, processor name and features of this machine."""
+    import llvmlite.binding as llvm
+
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+@cache
+def _initialize() -> None:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+
+
+def preferred_lanes() -> int:
+    """States computed side by side on this processor: one vector register of doubles."""
+    features = host()[2].split(",")
+    if "+avx512f" in features:
+        return 8
+    return 4 if "+avx" in features else 2
+
+
+def llvm_version() -> str:
+    """LLVM's version with llvmlite's."""
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    return ".".join(map(str, llvm.llvm_version_info)) + "/" + llvmlite.__version__
+
+
+def target_machine(level: int) -> Any:
+    """Code generator for this processor at optimization `level` (0-3)."""
+    import llvmlite.binding as llvm
+
+    _initialize()
+    triple, cpu, features = host()
+    # full-width registers where the processor has them
+    features += ",-prefer-256-bit"
+    return llvm.Target.from_triple(triple).create_target_machine(
+        cpu=cpu, features=features, opt=level, jit=True
+    )
+
+
+def compile_ir(text: str, *, level: int = 2, passes: bool = True) -> bytes:
+    """Object code of a module; `passes` runs the optimizer before code generation."""
+    import llvmlite.binding as llvm
+
+    machine = target_machine(level)
+    module = llvm.parse_assembly(text)
+    if passes:
+        tuning = llvm.create_pipeline_tuning_options(speed_level=2)
+        tuning.slp_vectorization = False
+        tuning.loop_vectorization = False
+        builder = llvm.create_pass_builder(machine, tuning)
+        builder.getModulePassManager().run(module, builder)
+    code: bytes = machine.emit_object(module)
+    return code
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Machine code in memory; lives as long as this object."""
+
+    engine: Any
+    seconds: float
+
+    def function(self, name: str, *argtypes: Any) -> Any:
+        """A function of the module as a ctypes callable that releases the interpreter lock."""
+        address = self.engine.get_function_address(name)
+        return ctypes.CFUNCTYPE(None, *argtypes)(address)
+
+
+def load(code: bytes) -> Loaded:
+    """Object code ready to run."""
+    import llvmlite.binding as llvm
+
+    begin = time.perf_counter()
+    _initialize()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine(1))
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return Loaded(engine, time.perf_counter() - begin)

@@ -1,0 +1,280 @@
+"""A tape as LLVM IR text: one function over scalars or over short vectors (lanes) of states.
+
+Sines, cosines and arctangents are our own polynomials (Cody & Waite reduction, Cephes coefficients), so that
+all lanes are computed at once; products and sums may contract into fused operations, nothing else is relaxed.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, SIN, SQRT, SUB
+from .tape import Tape
+
+_SIN = (
+    1.58962301576546568060e-10,
+    -2.50507477628578072866e-8,
+    2.75573136213857245213e-6,
+    -1.98412698295895385996e-4,
+    8.33333333332211858878e-3,
+    -1.66666666666666307295e-1,
+)
+_COS = (
+    -1.13585365213876817300e-11,
+    2.08757008419747316778e-9,
+    -2.75573141792967388112e-7,
+    2.48015872888517045348e-5,
+    -1.38888888888730564116e-3,
+    4.16666666666665929218e-2,
+)
+_ATAN_P = (
+    -8.750608600031904122785e-1,
+    -1.615753718733365076637e1,
+    -7.500855792314704667340e1,
+    -1.228866684490136173410e2,
+    -6.485021904942025371773e1,
+)
+_ATAN_Q = (
+    1.0,
+    2.485846490142306297962e1,
+    1.650270098316988542046e2,
+    4.328810604912902668951e2,
+    4.853903996359136964868e2,
+    1.945506571482613964425e2,
+)
+_HALF_PI = (1.57079625129699707031e0, 7.54978941586159635336e-8, 5.39030285815811905290e-15)
+_ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to an integer
+_MORE_BITS = 6.123233995736765886130e-17  # pi/2 beyond double precision
+
+
+def double(x: float) -> str:
+    """`x` as an exact IR literal."""
+    return "0x" + struct.pack(">d", float(x)).hex().upper()
+
+
+class Emitter:
+    """Writes instructions on `lanes` doubles at once; values are names of IR registers or literals."""
+
+    def __init__(self, lanes: int):
+        self.lanes = lanes
+        self.V = "double" if lanes == 1 else f"<{lanes} x double>"
+        self.I = "i64" if lanes == 1 else f"<{lanes} x i64>"
+        self.B = "i1" if lanes == 1 else f"<{lanes} x i1>"
+        self.suffix = "f64" if lanes == 1 else f"v{lanes}f64"
+        self.align = 8 * lanes
+        self.lines: list[str] = []
+        self._count = 0
+
+    def fresh(self) -> str:
+        """A new register name."""
+        self._count += 1
+        return f"%r{self._count}"
+
+    def emit(self, text: str) -> str:
+        """Append an instruction with a result; returns its register."""
+        register = self.fresh()
+        self.lines.append(f"  {register} = {text}")
+        return register
+
+    def do(self, text: str) -> None:
+        """Append an instruction without a result."""
+        self.lines.append("  " + text)
+
+    def const(self, x: float) -> str:
+        """A number in all lanes."""
+        return double(x) if self.lanes == 1 else f"<{', '.join([f'double {double(x)}'] * self.lanes)}>"
+
+    def iconst(self, x: int) -> str:
+        """An integer in all lanes."""
+        return str(x) if self.lanes == 1 else f"<{', '.join([f'i64 {x}'] * self.lanes)}>"
+
+    def f(self, op: str, a: str, b: str) -> str:
+        """Floating-point `fadd`, `fsub`, `fmul` or `fdiv`."""
+        return self.emit(f"{op} contract {self.V} {a}, {b}")
+
+    def i(self, op: str, a: str, b: str) -> str:
+        """Integer operation in lanes."""
+        return self.emit(f"{op} {self.I} {a}, {b}")
+
+    def call(self, name: str, *args: str) -> str:
+        """Intrinsic on lanes, e.g. `sqrt`."""
+        return self.emit(
+            f"call {self.V} @llvm.{name}.{self.suffix}({', '.join(f'{self.V} {a}' for a in args)})"
+        )
+
+    def bits(self, x: str) -> str:
+        """Doubles as integers."""
+        return self.emit(f"bitcast {self.V} {x} to {self.I}")
+
+    def value(self, x: str) -> str:
+        """Integers as doubles."""
+        return self.emit(f"bitcast {self.I} {x} to {self.V}")
+
+    def compare(self, predicate: str, a: str, b: str) -> str:
+        """Ordered comparison."""
+        return self.emit(f"fcmp {predicate} {self.V} {a}, {b}")
+
+    def select(self, condition: str, a: str, b: str) -> str:
+        """`a` where `condition`, else `b`."""
+        return self.emit(f"select {self.B} {condition}, {self.V} {a}, {self.V} {b}")
+
+    def element(self, pointer: str, index: str | int, type: str = "") -> str:
+        """Address of an element of `type` (default: one value in all lanes)."""
+        return self.emit(f"getelementptr inbounds {type or self.V}, ptr {pointer}, i64 {index}")
+
+    def load(self, pointer: str, index: str | int) -> str:
+        """Value in all lanes."""
+        return self.emit(f"load {self.V}, ptr {self.element(pointer, index)}, align {self.align}")
+
+    def store(self, x: str, pointer: str, index: str | int) -> None:
+        """Store a value in all lanes."""
+        self.do(f"store {self.V} {x}, ptr {self.element(pointer, index)}, align {self.align}")
+
+    @contextmanager
+    def loop(self, count: str | int, step: int = 1) -> Iterator[str]:
+        """Counted loop from 0 (skipped when empty); yields the counter."""
+        name = f"L{self._count}"
+        self._count += 1
+        self.do(f"br label %{name}.entry")
+        self.lines.append(f"{name}.entry:")
+        self.do(f"br label %{name}.head")
+        self.lines.append(f"{name}.head:")
+        counter = f"%{name}.i"
+        self.do(f"{counter} = phi i64 [0, %{name}.entry], [%{name}.next, %{name}.latch]")
+        self.do(f"%{name}.go = icmp slt i64 {counter}, {count}")
+        self.do(f"br i1 %{name}.go, label %{name}.body, label %{name}.exit")
+        self.lines.append(f"{name}.body:")
+        yield counter
+        self.do(f"br label %{name}.latch")
+        self.lines.append(f"{name}.latch:")
+        self.do(f"%{name}.next = add nsw i64 {counter}, {step}")
+        self.do(f"br label %{name}.head")
+        self.lines.append(f"{name}.exit:")
+
+    @contextmanager
+    def when(self, condition: str) -> Iterator[None]:
+        """Instructions executed only if the i1 `condition` holds."""
+        name = f"W{self._count}"
+        self._count += 1
+        self.do(f"br i1 {condition}, label %{name}.then, label %{name}.end")
+        self.lines.append(f"{name}.then:")
+        yield
+        self.do(f"br label %{name}.end")
+        self.lines.append(f"{name}.end:")
+
+    def polynomial(self, coefficients: Sequence[float], z: str) -> str:
+        """Horner's scheme, highest power first."""
+        p = self.const(coefficients[0])
+        for c in coefficients[1:]:
+            p = self.f("fadd", self.f("fmul", p, z), self.const(c))
+        return p
+
+    def sincos(self, x: str) -> tuple[str, str]:
+        """Sine and cosine, within 1.2e-16 of the reduced argument's."""
+        shifted = self.f("fadd", self.f("fmul", x, self.const(0.63661977236758134308)), self.const(_ROUND))
+        quarter = self.bits(shifted)
+        turns = self.emit(f"fsub {self.V} {shifted}, {self.const(_ROUND)}")
+        r = x
+        for part in _HALF_PI:
+            r = self.f("fsub", r, self.f("fmul", turns, self.const(part)))
+        z = self.f("fmul", r, r)
+        sine = self.f("fadd", self.f("fmul", self.f("fmul", r, z), self.polynomial(_SIN, z)), r)
+        head = self.f("fsub", self.const(1.0), self.f("fmul", z, self.const(0.5)))
+        cosine = self.f("fadd", self.f("fmul", self.f("fmul", z, z), self.polynomial(_COS, z)), head)
+        odd = self.i("and", quarter, self.iconst(1))
+        swap = self.emit(f"icmp ne {self.I} {odd}, {self.iconst(0)}")
+        sign_s = self.i("shl", self.i("and", quarter, self.iconst(2)), self.iconst(62))
+        next_quarter = self.i("add", quarter, self.iconst(1))
+        sign_c = self.i("shl", self.i("and", next_quarter, self.iconst(2)), self.iconst(62))
+        s = self.bits(self.select(swap, cosine, sine))
+        c = self.bits(self.select(swap, sine, cosine))
+        return self.value(self.i("xor", s, sign_s)), self.value(self.i("xor", c, sign_c))
+
+    def atan2(self, y: str, x: str) -> str:
+        """Angle of the point (x, y)."""
+        ax, ay = self.call("fabs", x), self.call("fabs", y)
+        steep = self.compare("ogt", ay, ax)
+        low, high = self.select(steep, ax, ay), self.select(steep, ay, ax)
+        nonzero = self.compare("ogt", high, self.const(0.0))
+        t = self.f("fdiv", low, self.select(nonzero, high, self.const(1.0)))
+        far = self.compare("ogt", t, self.const(0.66))
+        shifted = self.f("fdiv", self.f("fsub", t, self.const(1.0)), self.f("fadd", t, self.const(1.0)))
+        r = self.select(far, shifted, t)
+        z = self.f("fmul", r, r)
+        ratio = self.f("fdiv", self.polynomial(_ATAN_P, z), self.polynomial(_ATAN_Q, z))
+        angle = self.f("fadd", r, self.f("fmul", self.f("fmul", r, z), ratio))
+        eighth = self.f("fadd", angle, self.const(0.5 * _MORE_BITS))
+        angle = self.select(far, self.f("fadd", eighth, self.const(0.78539816339744830962)), angle)
+        mirrored = self.f(
+            "fadd", self.f("fsub", self.const(_MORE_BITS), angle), self.const(1.5707963267948966)
+        )
+        angle = self.select(steep, mirrored, angle)
+        behind = self.f(
+            "fadd", self.f("fsub", self.const(2.0 * _MORE_BITS), angle), self.const(3.141592653589793)
+        )
+        angle = self.select(self.compare("olt", x, self.const(0.0)), behind, angle)
+        return self.call("copysign", angle, y)
+
+
+DECLARED = ("sqrt", "fabs", "copysign", "minnum", "maxnum", "pow")
+
+
+def declarations(lanes: int) -> str:
+    """Intrinsics that kernels on `lanes` may call."""
+    e = Emitter(lanes)
+    arity = {"sqrt": 1, "fabs": 1}
+    return "\n".join(
+        f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity.get(name, 2))})" for name in DECLARED
+    )
+
+
+_BINARY = {ADD: "fadd", SUB: "fsub", MUL: "fmul"}
+
+
+def kernel(name: str, tape: Tape, lanes: int, attributes: str = "") -> str:
+    """IR of `tape` as `void name(ptr inputs..., ptr outputs...)`; scalar k of an argument fills lanes k."""
+    e = Emitter(lanes)
+    values: list[str] = []
+    pairs: dict[int, tuple[str, str]] = {}
+    for op, a, b in tape.rows:
+        if op == CONST:
+            values.append(e.const(a))
+        elif op == INPUT:
+            values.append(e.load(f"%in{a}", b))
+        elif op in (SIN, COS):
+            if a not in pairs:
+                pairs[a] = e.sincos(values[a])
+            values.append(pairs[a][op == COS])
+        else:
+            values.append(_operation(e, op, values[a], None if b is None else values[b]))
+    for k, rows in enumerate(tape.results):
+        for j, row in enumerate(rows):
+            e.store(values[row], f"%out{k}", j)
+    arguments = [f"ptr noalias nocapture readonly align {e.align} %in{k}" for k in range(len(tape.inputs))]
+    arguments += [f"ptr noalias nocapture align {e.align} %out{k}" for k in range(len(tape.outputs))]
+    body = "\n".join(e.lines)
+    return f"define internal void @{name}({', '.join(arguments)}) nounwind {attributes} {{\n{body}\n  ret void\n}}\n"
+
+
+def _operation(e: Emitter, op: int, a: str, b: str | None) -> str:
+    if op in _BINARY:
+        assert b is not None
+        return e.f(_BINARY[op], a, b)
+    if op == NEG:
+        return e.emit(f"fneg {e.V} {a}")
+    if op == INV:
+        return e.f("fdiv", e.const(1.0), a)
+    if op == SQRT:
+        return e.call("sqrt", a)
+    if op == ABS:
+        return e.call("fabs", a)
+    assert b is not None
+    if op == LESS:
+        return e.select(e.compare("olt", a, b), e.const(1.0), e.const(0.0))
+    if op in (MIN, MAX):
+        return e.select(e.compare("olt" if op == MIN else "ogt", a, b), a, b)
+    if op == ATAN2:
+        return e.atan2(a, b)
+    raise ValueError(f"no instruction for operation {op}")

@@ -1,0 +1,151 @@
+"""A straight-line program: the part of a graph that some outputs need, in the order of execution."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .graph import (
+    ABS,
+    ADD,
+    ATAN2,
+    CONST,
+    COS,
+    INPUT,
+    INV,
+    LESS,
+    MAX,
+    MIN,
+    MUL,
+    NEG,
+    OP_NAMES,
+    SIN,
+    SQRT,
+    SUB,
+    Node,
+    Scalar,
+    reachable,
+)
+
+_FREE = (CONST, INPUT)
+_NUMPY = {
+    ADD: np.add,
+    SUB: np.subtract,
+    MUL: np.multiply,
+    NEG: np.negative,
+    INV: np.reciprocal,
+    SQRT: np.sqrt,
+    SIN: np.sin,
+    COS: np.cos,
+    MIN: np.minimum,
+    MAX: np.maximum,
+    ABS: np.abs,
+    ATAN2: np.arctan2,
+}
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Program of (op, a, b) rows; a, b are rows, or a constant, or an input's (argument, index).
+
+    `inputs` and `outputs` give the size of every argument by name, in the order of the compiled call;
+    `results` gives for every output the rows of its scalars.
+    """
+
+    rows: tuple[tuple[int, Any, Any], ...]
+    inputs: dict[str, int]
+    outputs: dict[str, int]
+    results: tuple[tuple[int, ...], ...]
+
+    @staticmethod
+    def build(inputs: Mapping[str, int], outputs: Mapping[str, Sequence[Scalar]]) -> Tape:
+        """Tape of the named `outputs`; `inputs` gives names and sizes of the arguments of their graph."""
+        argument = {name: k for k, name in enumerate(inputs)}
+        rows: list[tuple[int, Any, Any]] = []
+        place: dict[int, int] = {}
+        for node in reachable([x for xs in outputs.values() for x in xs]):
+            place[node.id] = len(rows)
+            if node.op == CONST:
+                rows.append((CONST, node.value, None))
+            elif node.op == INPUT:
+                name, index = node.value
+                rows.append((INPUT, argument[name], index))
+            else:
+                rows.append((node.op, place[node.a.id], None if node.b is None else place[node.b.id]))
+        constants: dict[float, int] = {}
+
+        def result(x: Scalar) -> int:
+            if isinstance(x, Node):
+                return place[x.id]
+            if x not in constants:
+                constants[x] = len(rows)
+                rows.append((CONST, float(x), None))
+            return constants[x]
+
+        results = tuple(tuple(result(x) for x in xs) for xs in outputs.values())
+        sizes = {name: len(xs) for name, xs in outputs.items()}
+        return Tape(tuple(rows), dict(inputs), sizes, results)
+
+    @cached_property
+    def counts(self) -> dict[str, int]:
+        """Number of operations of each kind."""
+        return dict(Counter(OP_NAMES[op] for op, _, _ in self.rows if op not in _FREE))
+
+    @cached_property
+    def cost(self) -> int:
+        """Operations in units of an addition (a sine-cosine pair 25, a division or root 8)."""
+        weight = {"sin": 13, "cos": 13, "inv": 8, "sqrt": 8, "atan2": 30}
+        return sum(n * weight.get(op, 1) for op, n in self.counts.items())
+
+    def evaluate(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        """The outputs by NumPy, broadcasting over leading axes: slow, for checks."""
+        lead = np.broadcast_shapes(*(np.shape(x)[:-1] for x in arguments))
+        values: list[Any] = []
+        for op, a, b in self.rows:
+            if op == CONST:
+                values.append(a)
+            elif op == INPUT:
+                values.append(np.asarray(arguments[a])[..., b])
+            elif op == LESS:
+                values.append(np.where(np.less(values[a], values[b]), 1.0, 0.0))
+            elif b is None:
+                values.append(_NUMPY[op](values[a]))
+            else:
+                values.append(_NUMPY[op](values[a], values[b]))
+        return [
+            np.stack([np.broadcast_to(values[i], lead) for i in rows], axis=-1)
+            if rows
+            else np.zeros((*lead, 0))
+            for rows in self.results
+        ]
+
+    def casadi(self, name: str = "f") -> Any:
+        """The same program as a `casadi.Function`, for optimisers that speak CasADi."""
+        import casadi as ca
+
+        unary = {
+            NEG: lambda x: -x,
+            INV: lambda x: 1 / x,
+            SQRT: ca.sqrt,
+            SIN: ca.sin,
+            COS: ca.cos,
+            ABS: ca.fabs,
+        }
+        binary = {MIN: ca.fmin, MAX: ca.fmax, LESS: ca.lt, ATAN2: ca.atan2}
+        binary |= {ADD: lambda x, y: x + y, SUB: lambda x, y: x - y, MUL: lambda x, y: x * y}
+        arguments = [ca.SX.sym(n, size) for n, size in self.inputs.items()]
+        values: list[Any] = []
+        for op, a, b in self.rows:
+            if op == CONST:
+                values.append(ca.SX(a))
+            elif op == INPUT:
+                values.append(arguments[a][b])
+            else:
+                values.append(unary[op](values[a]) if b is None else binary[op](values[a], values[b]))
+        outs = [ca.vertcat(*[values[i] for i in rows]) if rows else ca.SX(0, 1) for rows in self.results]
+        return ca.Function(name, arguments, outs, list(self.inputs), list(self.outputs))
