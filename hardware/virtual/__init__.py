@@ -4,6 +4,7 @@ from .bus import Ledger, Timing, VirtualBus
 from .faults import NO_FAULTS, CablePull, FaultPlan, ServoFault, WireFault
 from .motor import MOTORS, Gear, Motor, Plant, joints
 from .port import MemoryPort
+from .pty import PtyServer, serve
 from .servo import Quirks, VirtualServo
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "MemoryPort",
     "Motor",
     "Plant",
+    "PtyServer",
     "Quirks",
     "ServoFault",
     "Timing",
@@ -23,4 +25,5 @@ __all__ = [
     "VirtualServo",
     "WireFault",
     "joints",
+    "serve",
 ]

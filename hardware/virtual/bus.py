@@ -69,10 +69,13 @@ class Ledger:
 
 
 @dataclass(order=True)
-class _Delivery:
+class Delivery:
+    """Bytes on the way to the host: when they arrive, and by how much a fault holds them back [s]."""
+
     time: float
     order: int
     data: bytes = field(compare=False)
+    held: float = field(compare=False, default=0.0)
 
 
 class VirtualBus:
@@ -83,6 +86,8 @@ class VirtualBus:
         timing: Of the adapter.
         faults: What goes wrong.
         lenient: Servos accept instructions whose body is not stuffed, as the official SDK sends them.
+        paced: The clock waits for the wire; False when real time moves it (pseudo-terminal): wire time is then kept
+            in the ledger alone.
 
     Host bytes go in with `send`, come back with `receive`; `advance` moves the clock. All is deterministic.
     """
@@ -94,8 +99,10 @@ class VirtualBus:
         timing: Timing = Timing(),  # noqa: B008 - frozen
         faults: FaultPlan = NO_FAULTS,
         lenient: bool = True,
+        paced: bool = True,
     ) -> None:
         self.servos = list(servos)
+        self.paced = paced
         self.timing, self.faults = timing, faults
         self.dice = FaultDice(faults)
         self.ledger = Ledger()
@@ -104,7 +111,7 @@ class VirtualBus:
         self._last_byte = 0.0
         self._periods = 0
         self._order = 0
-        self._deliveries: list[_Delivery] = []
+        self._deliveries: list[Delivery] = []
         self._pending = sorted((f for f in faults.servos), key=lambda f: f.start)
         self._revivals: list[tuple[float, int]] = []
 
@@ -157,25 +164,26 @@ class VirtualBus:
         """Host writes bytes at a bit rate [bit/s]: the clock advances by their time on the wire, replies are queued."""
         self.ledger.instruction_bytes += len(data)
         self.ledger.usb += self.timing.usb
-        self.advance(self.timing.usb)
-        if self.time - self._last_byte > BYTE_GAP:
+        self._pass(self.time + self.timing.usb)
+        if self.paced and self.time - self._last_byte > BYTE_GAP:
             self._parser.flush()
-        if self.faults.unplugged(self.time):
-            self._wire(len(data), baud)
-            return
-        pieces = self.dice.apply(data, _frame_id(data), "instruction", self.time)
         start = self.time
         self._wire(len(data), baud)
-        end = start
-        for delay, piece in pieces:
-            end = max(end, start + delay) + len(piece) * BITS_PER_BYTE / baud
-            self.advance_to(end)
-            self._last_byte = self.time
-            for packet in self._parser.feed(piece):
-                if isinstance(packet, Packet) and not packet.is_status:
-                    self.ledger.instructions += 1
-                    end = max(end, self._answer(packet, baud))
-        self.advance_to(start + len(data) * BITS_PER_BYTE / baud)
+        if not self.faults.unplugged(start):
+            end = start
+            for delay, piece in self.dice.apply(data, _frame_id(data), "instruction", start):
+                end = max(end, start + delay) + len(piece) * BITS_PER_BYTE / baud
+                self._pass(end)
+                self._last_byte = self.time
+                for packet in self._parser.feed(piece):
+                    if isinstance(packet, Packet) and not packet.is_status:
+                        self.ledger.instructions += 1
+                        end = max(end, self._answer(packet, baud))
+        self._pass(start + len(data) * BITS_PER_BYTE / baud)
+
+    def _pass(self, time: float) -> None:
+        if self.paced:
+            self.advance_to(time)
 
     @property
     def next_delivery(self) -> float | None:
@@ -187,6 +195,12 @@ class VirtualBus:
         out = b""
         while self._deliveries and self._deliveries[0].time <= self.time + 1e-12:
             out += heapq.heappop(self._deliveries).data
+        return out
+
+    def deliveries(self) -> list[Delivery]:
+        """Everything on the way to the host, whenever it would arrive; taken from the queue."""
+        out = sorted(self._deliveries)
+        self._deliveries.clear()
         return out
 
     def _wire(self, count: int, baud: int) -> None:
@@ -264,26 +278,26 @@ class VirtualBus:
         end = start + len(frame) * BITS_PER_BYTE / baud
         if not self.faults.unplugged(start):
             for delay, piece in self.dice.apply(frame, frame[4], "status", start):
-                self._deliver(piece, start + delay, baud)
+                self._deliver(piece, start + delay, baud, delay)
         return end
 
-    def _deliver(self, piece: bytes, start: float, baud: int) -> None:
+    def _deliver(self, piece: bytes, start: float, baud: int, held: float) -> None:
         """Queue bytes for the host: full USB packets as they fill, the rest after the latency timer."""
         size = self.timing.packet
         if self.timing.latency_timer == 0:
-            self._queue(piece, start + len(piece) * BITS_PER_BYTE / baud)
+            self._queue(piece, start + len(piece) * BITS_PER_BYTE / baud, held)
             return
         for place in range(0, len(piece), size):
             part = piece[place : place + size]
             end = start + (place + len(part)) * BITS_PER_BYTE / baud
             wait = self.timing.latency_timer if len(part) < size else 0.0
             self.ledger.latency += wait
-            self._queue(part, end + wait)
+            self._queue(part, end + wait, held)
 
-    def _queue(self, data: bytes, time: float) -> None:
+    def _queue(self, data: bytes, time: float, held: float) -> None:
         if data:
             self._order += 1
-            heapq.heappush(self._deliveries, _Delivery(time, self._order, data))
+            heapq.heappush(self._deliveries, Delivery(time, self._order, data, held))
 
 
 def wanted(packet: Packet) -> Iterator[tuple[int, int, int]]:
