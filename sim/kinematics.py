@@ -8,6 +8,7 @@ rows come before linear ones, as in MuJoCo's six-vectors; all are in world axes.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from math import prod
 from typing import Literal, NamedTuple
 
 import mujoco
@@ -289,9 +290,10 @@ def _batched(fill: Callable[..., None], shape: tuple[int, ...], *inputs: tuple[A
         if array.ndim == 0 or array.shape[-1] != width:
             raise ModelError(f"{label} of shape {array.shape} does not fit: the model needs (..., {width})")
     lead = np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
-    flat = [np.broadcast_to(x, (*lead, x.shape[-1])).reshape(-1, x.shape[-1]) for x in arrays]
-    out = np.empty((len(flat[0]), *shape))
-    for i in range(0, len(out), _CHUNK):
+    n = prod(lead)
+    flat = [np.broadcast_to(x, (*lead, x.shape[-1])).reshape(n, x.shape[-1]) for x in arrays]
+    out = np.empty((n, *shape))
+    for i in range(0, n, _CHUNK):
         part = slice(i, i + _CHUNK)
         fill(out[part], *(np.ascontiguousarray(x[part].T) for x in flat))
     return out.reshape(*lead, *shape)
