@@ -7,8 +7,8 @@ import numpy as np
 
 from .errors import ModelError
 
-# MuJoCo refuses a body without inertia (below 1e-15). This much, relative to m l^2, shifts the frequencies of a
-# chain of point masses by the same relative amount; the twist of a ball link feels nothing else, and no torque.
+# MuJoCo refuses a body without inertia (below 1e-15). This much, relative to m l^2, shifts the frequencies of
+# a chain of point masses by the same relative amount; the twist of a ball link feels nothing else.
 _POINT_INERTIA = 1e-9
 _LEAST_INERTIA = 2e-15  # [kg m^2]
 
@@ -27,8 +27,8 @@ def chain(
 ) -> mujoco.MjSpec:
     """Chain of n equal links hanging straight down from the origin.
 
-    Bodies are `link_1` to `link_n` from the top, joints `joint_1` to `joint_n`, the lower end is the site `tip`.
-    Hinges turn about -y, so that a positive angle swings the chain towards +x.
+    Bodies are `link_1` to `link_n` from the top, joints `joint_1` to `joint_n`, the lower end is the
+    site `tip`. Hinges turn about -y, so that a positive angle swings the chain towards +x.
 
     Args:
         n: number of links.
@@ -37,7 +37,7 @@ def chain(
         joint: between links; a hinge chain moves in the x-z plane.
         radius: of the drawn links [m]; by default a twelfth of a link, at most 0.03 m.
         damping: of every joint [N m s/rad].
-        fixed: the upper end hangs from the world; otherwise the first link is free (`root` instead of `joint_1`).
+        fixed: the upper end hangs from the world; otherwise the first link is free (joint `root`).
         point_masses: each link is a massless rod with mass/n at its lower end; otherwise a uniform capsule.
         contacts: links touch the floor and loose things (never each other).
 

@@ -28,6 +28,8 @@ _FIXES = (
         '<compiler balanceinertia="true"/> replace them by their mean',
     ),
     (r"mass, inertia or density are negative", "masses, inertias and densities are positive"),
+    (r"_decoder", "the file is damaged or not of the kind that its ending says"),
+    (r"repeated default class", "give the default classes different names"),
     (r"repeated name", "names are unique within one kind: rename one of them"),
     (
         r"not found in|unknown transmission target|unknown element",
@@ -84,29 +86,28 @@ def explain(path: Path, message: str) -> ModelError:
     missing = re.search(r"Error opening file '(.*?)'", message)
     if missing:
         return ModelError(_missing(path, missing[1]))
-    tag, line = _place(message)
-    file = _file_of_line(path, line, tag)
     what = (
         re.sub(r"^((XML )?Error: )+", "", message.strip()).split("\n")[0].removeprefix("Schema violation: ")
     )
+    file, line, tag = _place(path, message, what)
+    where = f"{file}{f':{line}' if line else ''}"
     name = re.search(r"Element name '(.+?)'", message)
     if name and f"'{name[1]}'" not in what:
         what += f" ({name[1]!r})"
-    lines = [f"{file}{f':{line}' if line else ''}: {what}", *_source(file, line)]
-    if what.startswith("unrecognized attribute"):
-        lines.append(_suggest(what.split("'")[1], _schema()[1].get(tag, set()), f"<{tag}> takes"))
-    elif what.startswith("unrecognized element"):
+    if what == "unrecognized element":
         parent = _parent(file, line, tag)
-        lines[0] = f"{file}:{line}: unknown element <{tag}>" + (f" in <{parent}>" if parent else "")
+        what = f"unknown element <{tag}>" + (f" in <{parent}>" if parent else "")
         known = _schema()[0].get(parent, set()) if parent else set(_schema()[1])
-        lines.append(_suggest(tag, known, f"<{parent}> takes" if parent else "MJCF knows"))
+        fix = [_suggest(tag, known, f"<{parent}> takes" if parent else "MJCF knows")]
+    elif what.startswith("unrecognized attribute"):
+        fix = [_suggest(what.split("'")[1], _schema()[1].get(tag, set()), f"<{tag}> takes")]
     else:
         repeated = re.search(r"repeated name '(.+?)'", what)
         if repeated:
             places = [str(n) for n, text in _lines(file) if f'name="{repeated[1]}"' in text]
-            lines[0] += f" (on lines {', '.join(places)})" if places else ""
-        lines += [fix for pattern, fix in _FIXES if re.search(pattern, what)][:1]
-    return ModelError("\n".join(lines))
+            what += f" (on lines {', '.join(places)})" if len(places) > 1 else ""
+        fix = [fix for pattern, fix in _FIXES if re.search(pattern, what)][:1]
+    return ModelError("\n".join([f"{where}: {what}", *_source(file, line), *fix]))
 
 
 def nonfinite_numbers(path: Path) -> list[str]:
@@ -123,10 +124,24 @@ def nonfinite_numbers(path: Path) -> list[str]:
     return found
 
 
-def _place(message: str) -> tuple[str, int | None]:
-    tag = re.search(r"Element '(.+?)', line", message)
-    line = re.search(r", line (\d+)", message)
-    return tag[1] if tag else "", int(line[1]) if line else None
+def _place(path: Path, message: str, what: str) -> tuple[Path, int | None, str]:
+    """File, line and tag that a message of MuJoCo is about."""
+    element = re.search(r"Element '(.+?)', line", message)
+    tag = element[1] if element else ""
+    given = re.search(r", line ([1-9]\d*)", message)
+    if given:
+        return path, int(given[1]), tag
+    # Of included files MuJoCo tells line 0: take the only line that fits.
+    name = re.search(r"Element name '(.+?)'", message)
+    attribute = re.search(r"attribute:? '(.+?)'", what)
+    if name:
+        sign = rf"name\s*=\s*[\"']{re.escape(name[1])}[\"']"
+    elif tag:
+        sign = rf"<{re.escape(tag)}\b" + (rf"[^>]*\b{re.escape(attribute[1])}\s*=" if attribute else "")
+    else:
+        return path, None, tag
+    hits = [(file, number) for file in _files(path) for number, line in _lines(file) if re.search(sign, line)]
+    return (*hits[0], tag) if len(hits) == 1 else (path, None, tag)
 
 
 def _syntax(path: Path) -> str:
@@ -153,8 +168,9 @@ def _missing(path: Path, name: str) -> str:
         (path, None),
     )
     wanted = path.parent / name
-    stems = [p.name for p in wanted.parent.iterdir()] if wanted.parent.is_dir() else []
-    close = get_close_matches(wanted.name, stems, n=1)
+    there = wanted.parent.iterdir() if wanted.parent.is_dir() else ()
+    stems = {p.stem: p.name for p in there if p.suffix.lower() in extensions}
+    close = [stems[stem] for stem in get_close_matches(wanted.stem, stems, n=1)]
     lines = [
         f"{place[0]}{f':{place[1]}' if place[1] else ''}: {kind} {Path(name).name!r} is missing"
         + (f" (did you mean {close[0]!r}?)" if close else ""),
@@ -188,15 +204,6 @@ def _lines(file: Path) -> list[tuple[int, str]]:
     text = file.read_text(encoding="utf-8", errors="replace")
     blank = re.sub(r"<!--.*?-->", lambda m: re.sub(r"[^\n]", " ", m[0]), text, flags=re.DOTALL)
     return list(enumerate(blank.split("\n"), start=1))
-
-
-def _file_of_line(path: Path, line: int | None, tag: str) -> Path:
-    # MuJoCo gives a line without saying of which file: the first file that has the element there.
-    for file in _files(path) if line else []:
-        text = dict(_lines(file)).get(line or 0, "")
-        if (f"<{tag}" if tag else "<") in text:
-            return file
-    return path
 
 
 def _source(file: Path, line: int | None) -> list[str]:
@@ -235,7 +242,7 @@ def _schema() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
     children: dict[str, set[str]] = {}
     attributes: dict[str, set[str]] = {}
     stack: list[str] = []
-    for row in mujoco.mj_printSchema(False, True).replace("&nbsp;", " ").splitlines():
+    for row in mujoco.mj_printSchema(False, False).replace("(world)body", "body").splitlines():
         head = re.match(r"( *)(\w+) \(.\)(.*)", row)
         if head:
             depth = len(head[1]) // 3
@@ -245,5 +252,11 @@ def _schema() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
             attributes.setdefault(head[2], set()).update(head[3].split())
         elif stack:
             attributes[stack[-1]].update(row.split())
-    children.setdefault("body", set()).add("body")
+    # The table writes these once, as one recursive element.
+    children["body"] |= {"body", "frame", "replicate"}
+    children["mujoco"] = children["mujoco"] - {"body"} | {"worldbody"}
+    children["default"].add("default")
+    for alias in ("worldbody", "frame", "replicate"):
+        children[alias] = children["body"]
+    attributes["worldbody"] = set()
     return children, attributes

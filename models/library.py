@@ -6,10 +6,12 @@ from difflib import get_close_matches
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from . import urdf
 from .diagnose import captured_warnings, explain, listing, nonfinite_numbers
 from .errors import ModelError, ModelWarning
+from .naming import Kind, name_of
 
 _BUILT_IN = Path(__file__).parent / "mjcf"
 _EXTENSIONS = (".xml", ".urdf")
@@ -76,6 +78,9 @@ def load_model(name_or_path: str | Path, *, base: Path | None = None) -> mujoco.
 
 def _load(path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     text = _read(path)
+    bad = nonfinite_numbers(path)
+    if bad:
+        raise ModelError("\n".join([f"{path}: every number of a model must be finite", *bad]))
     notes: list[str] = []
     with captured_warnings() as messages:
         try:
@@ -84,12 +89,28 @@ def _load(path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
             model = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             raise explain(path, str(error)) from error
-    bad = nonfinite_numbers(path)
-    if bad:
-        raise ModelError("\n".join([f"{path}: every number of a model must be finite", *bad]))
-    for note in [*notes, *messages]:
-        warnings.warn(f"{path}: {note}", ModelWarning, stacklevel=4)
+    for note in [*notes, *_upside_down(model), *messages]:
+        warnings.warn(f"{path}: {note}", ModelWarning, stacklevel=3)
     return spec, model
+
+
+def _upside_down(model: mujoco.MjModel) -> list[str]:
+    """MuJoCo silently takes limits whose lower bound is the greater for no limits."""
+    notes = []
+    limits: tuple[tuple[Kind, str, str], ...] = (
+        ("joint", "range", "jnt_"),
+        ("actuator", "ctrlrange", "actuator_ctrl"),
+        ("actuator", "forcerange", "actuator_force"),
+    )
+    for kind, attribute, field in limits:
+        bounds, limited = getattr(model, field + "range"), getattr(model, field + "limited")
+        for index in np.flatnonzero((bounds[:, 0] > bounds[:, 1]) & (limited == 0)):
+            low, high = bounds[index]
+            notes.append(
+                f"{kind} {name_of(model, kind, int(index))!r} has no limit: its {attribute} {low:g} {high:g} "
+                "is upside down; write the lower bound first"
+            )
+    return notes
 
 
 def _read(path: Path) -> str:
@@ -120,15 +141,26 @@ def _data_folder() -> Path | None:
     return next((folder for folder in folders if (folder / "robots").is_dir()), None)
 
 
+def _model_files(folder: Path) -> list[Path]:
+    found = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in found if path.suffix.lower() in _EXTENSIONS]
+
+
 def _not_found(asked: str, tried: list[Path], built_in: tuple[str, ...], robots: tuple[str, ...]) -> str:
     stem = Path(asked).stem if Path(asked).suffix in _EXTENSIONS else asked
-    close = get_close_matches(stem, [*built_in, *robots], n=1)
+    beside = {path.stem: path.name for path in _model_files(tried[0].parent)}
+    known = {**beside, **{name: name for name in (*built_in, *robots)}}
+    close = [known[name] for name in get_close_matches(stem, known, n=1)]
     lines = [f"no model {asked!r}" + (f" (did you mean {close[0]!r}?)" if close else "")]
     lines.append("built-in models: " + ", ".join(built_in))
     if robots:
         lines.append("robots of the data folder: " + ", ".join(robots))
     elif os.environ.get("PANTOGRAPH_DATA"):
         lines.append(f"PANTOGRAPH_DATA is {os.environ['PANTOGRAPH_DATA']!r}, which has no folder 'robots'")
+    else:
+        lines.append(
+            "no data folder of further robots: set PANTOGRAPH_DATA to the folder that holds 'robots'"
+        )
     for path in tried:
         lines.append(f"looked for the file {path}; that folder holds {listing(path.parent, _EXTENSIONS)}")
     return "\n".join(lines)

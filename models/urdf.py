@@ -1,9 +1,10 @@
 """URDF into MuJoCo's description.
 
 Decisions, each of which the file's own `<mujoco><compiler .../></mujoco>` may overrule:
-- the root link stands fixed in the world; other links keep their names (`fusestatic` off), except that a floating
-  joint can only hang on the world, so that files with one are fused;
-- visual geoms are kept (`discardvisual` off), weigh nothing, and replace their link's collision geoms in pictures;
+- the root link stands fixed in the world; other links keep their names (`fusestatic` off), except that a
+  floating joint can only hang on the world, so that files with one are fused;
+- visual geoms are kept (`discardvisual` off), weigh nothing, and replace their link's collision geoms in
+  pictures;
 - inertias that no body can have are balanced (`balanceinertia` on), with a warning that names the links.
 `package://` and relative mesh paths are looked for beside the file and in the folders above it.
 """
@@ -38,21 +39,23 @@ def parse(path: Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         ModelError: broken XML or structure, or a mesh that is not there; lists all mistakes at once.
         ValueError: MuJoCo refuses the rest.
     """
+    if "<xacro:" in text:
+        raise ModelError(f"{path}: contains xacro macros; expand it first: xacro IN > {path.stem}.urdf")
     try:
         robot = ET.fromstring(text)
     except ET.ParseError as error:
         raise ModelError(f"{path}:{error.position[0]}: not well-formed XML: {error}") from error
-    if "xacro" in text and any(
-        "xacro" in element.tag or "${" in str(element.attrib) for element in robot.iter()
-    ):
-        raise ModelError(f"{path}: contains xacro macros; expand it first: xacro IN > {path.stem}.urdf")
     mistakes = _structure(robot) + _resolve_meshes(path, robot, notes)
     if mistakes:
         raise ModelError(
             "\n".join([f"{path}: {len(mistakes)} mistake(s) in this URDF", *("  " + m for m in mistakes)])
         )
     _settings(robot, notes)
-    spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
+    notes += _guessed_masses(robot)
+    try:
+        spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
+    except ValueError as error:
+        raise ValueError(re.sub(r"line \d+", "line 0", str(error))) from error  # lines of the rewritten text
     _draw_visuals(spec)
     return spec
 
@@ -171,6 +174,19 @@ def _unreal(link: ET.Element) -> bool:
         return False
     small, middle, large = np.linalg.eigvalsh(matrix)
     return bool(small + middle < large * (1 - 1e-6))
+
+
+def _guessed_masses(robot: ET.Element) -> list[str]:
+    """Without <inertial> a link of URDF has no mass; MuJoCo gives it that of its collision geoms."""
+    moved = {j.find("child").get("link") for j in robot.findall("joint") if j.get("type") != "fixed"}  # type: ignore[union-attr]
+    bare = [
+        link.get("name", "")
+        for link in robot.findall("link")
+        if link.get("name") in moved and link.find("inertial") is None and link.find("collision") is not None
+    ]
+    if not bare:
+        return []
+    return [f"no <inertial> in link {', '.join(bare)}; mass taken from its collision geoms at 1000 kg/m^3"]
 
 
 def _draw_visuals(spec: mujoco.MjSpec) -> None:
