@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0: a packet is a frozen value with encode and decode; a parser turns bytes into packets.
+"""Dynamixel Protocol 2.0: a packet is a frozen value with encode and decode; a parser makes packets of bytes.
 
 Source: https://emanual.robotis.com/docs/en/dxl/protocol2/ and https://emanual.robotis.com/docs/en/dxl/crc/.
 """
@@ -104,7 +104,7 @@ class Packet:
     params: bytes = b""
 
     def encode(self, *, stuffed: bool = True) -> bytes:
-        """Bytes on the wire; `stuffed=False` as the official SDK sends them (it computes stuffing, then drops it).
+        """Bytes on the wire; `stuffed=False` as the official SDK sends them (it drops its stuffing).
 
         A fast read reply is a status packet of the broadcast ID and is never stuffed.
         """
@@ -116,7 +116,7 @@ class Packet:
 
     @classmethod
     def decode(cls, frame: bytes, *, lenient: bool = False) -> Packet:
-        """Packet of exactly one frame; PacketError says what is wrong. `lenient`: an unstuffed body is fine."""
+        """Packet of one whole frame; PacketError says what is wrong. `lenient` takes an unstuffed body."""
         if len(frame) < 10 or frame[:4] != HEADER:
             raise PacketError(f"not a frame (header ff ff fd 00, at least 10 bytes): {frame[:16].hex(' ')}")
         length = frame[5] | frame[6] << 8
@@ -169,12 +169,13 @@ class Fault:
 class Parser:
     """Incremental parser: bytes in, packets and faults out, independent of how the bytes are cut into chunks.
 
-    It never raises and never waits for a frame that cannot come: a frame that breaks a rule gives up one byte and
-    the rest is scanned again, so that a packet inside a broken frame is found as soon as its last byte is there.
+    It never raises and never waits for a frame that cannot come: a frame that breaks a rule gives up one
+        byte and the rest is scanned again, so that a packet inside a broken frame is found as soon as its
+        last byte is there.
 
     Args:
-        lenient: Accept frames whose body is not stuffed, as the official SDK sends them; strict drops them, as
-            the protocol says.
+        lenient: Accept frames whose body is not stuffed, as the official SDK sends them; strict drops them,
+            as the protocol says.
     """
 
     NOISE_PIECE = 256  # bytes of noise reported in one fault at most

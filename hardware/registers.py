@@ -191,7 +191,7 @@ def model_names() -> tuple[str, ...]:
 
 @cache
 def control_table(model: str | int) -> ControlTable:
-    """Control table by model name (`xm430-w350`, any case) or number (1020); RegisterError lists what exists."""
+    """Control table by model name (`xm430-w350`, any case) or number (1020); RegisterError lists them."""
     from .tables.models import MODELS, build
 
     if isinstance(model, int):

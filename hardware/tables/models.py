@@ -1,8 +1,8 @@
 """What differs between the servo models: factory values, ranges and units, each with its manual page.
 
-Values were read from the sources of the ROBOTIS e-manual (github.com/ROBOTIS-GIT/emanual, docs/en/dxl/), which
-are the pages cited. `velocity=None`: no version of the page with the present velocity limit was at hand (older ones
-state higher limits, from before the limits were revised), so the default is left open.
+Values were read from the sources of the ROBOTIS e-manual (github.com/ROBOTIS-GIT/emanual, docs/en/dxl/),
+which are the pages cited. `velocity=None`: no version of the page with the present velocity limit was at
+hand (older ones state higher limits, from before the limits were revised), so the default is left open.
 """
 
 from __future__ import annotations
@@ -166,7 +166,8 @@ def build(name: str) -> ControlTable:
     for block in indirect:
         parts += rows.indirect_rows(block, 64, last)
     changes = _particular(model)
-    table = sorted((replace(r, **changes.get(r.name, {})) for r in parts), key=lambda r: r.address)  # type: ignore[arg-type]
+    table = [replace(r, **changes.get(r.name, {})) for r in parts]  # type: ignore[arg-type]
+    table.sort(key=lambda r: r.address)
     top = 6 if model.small else 7
     return ControlTable(
         model=name,

@@ -1,10 +1,11 @@
 """Rows that the X-series and MX(2.0) control tables have in common.
 
-Read from the ROBOTIS e-manual, https://emanual.robotis.com/docs/en/dxl/x/ (and mx/), one page a model, cited in
-`models.py`. What differs between models is filled in there.
+Read from the ROBOTIS e-manual, https://emanual.robotis.com/docs/en/dxl/x/ (and mx/), one page a model,
+cited in `models.py`. What differs between models is filled in there.
 """
 
 from math import pi
+from typing import Any
 
 from ..registers import IndirectBlock, Register
 
@@ -49,12 +50,12 @@ def _row(
     )
 
 
-def _rad(address: int, name: str, access: str, **more: object) -> Register:
-    return _row(address, 4, name, access, unit="rad", scale=POSITION, zero=CENTRE, **more)  # type: ignore[arg-type]
+def _rad(address: int, name: str, access: str, **more: Any) -> Register:
+    return _row(address, 4, name, access, unit="rad", scale=POSITION, zero=CENTRE, **more)
 
 
-def _speed(address: int, name: str, access: str, **more: object) -> Register:
-    return _row(address, 4, name, access, unit="rad/s", scale=VELOCITY, **more)  # type: ignore[arg-type]
+def _speed(address: int, name: str, access: str, **more: Any) -> Register:
+    return _row(address, 4, name, access, unit="rad/s", scale=VELOCITY, **more)
 
 
 COMMON: tuple[Register, ...] = (

@@ -1,4 +1,4 @@
-"""A half-duplex bus of virtual servos on a virtual clock, with a ledger of the time that bytes spend on the wire."""
+"""A half-duplex bus of virtual servos on a virtual clock, with a ledger of the time on the wire."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ class Timing:
     """Times of an adapter and its bus [s] that are not bytes.
 
     Args:
-        latency_timer: Of the USB adapter: received bytes wait this long for more before they reach the host (an FTDI
-            chip has 16 ms until it is set to 1 ms; it sends at once when `packet` bytes are there).
+        latency_timer: Of the USB adapter: received bytes wait this long for more before they reach the host
+            (an FTDI chip has 16 ms until it is set to 1 ms; it sends at once when `packet` bytes are
+            there).
         packet: Bytes that a USB packet carries.
         turnaround: Change of direction of a half-duplex line, before a servo's first byte.
         usb: Way of a transfer from host to adapter.
@@ -86,8 +87,8 @@ class VirtualBus:
         timing: Of the adapter.
         faults: What goes wrong.
         lenient: Servos accept instructions whose body is not stuffed, as the official SDK sends them.
-        paced: The clock waits for the wire; False when real time moves it (pseudo-terminal): wire time is then kept
-            in the ledger alone.
+        paced: The clock waits for the wire; False when real time moves it (pseudo-terminal): wire time is
+            then kept in the ledger alone.
 
     Host bytes go in with `send`, come back with `receive`; `advance` moves the clock. All is deterministic.
     """
@@ -96,7 +97,7 @@ class VirtualBus:
         self,
         servos: Iterable[VirtualServo],
         *,
-        timing: Timing = Timing(),  # noqa: B008 - frozen
+        timing: Timing = Timing(),
         faults: FaultPlan = NO_FAULTS,
         lenient: bool = True,
         paced: bool = True,
@@ -112,6 +113,7 @@ class VirtualBus:
         self._periods = 0
         self._order = 0
         self._deliveries: list[Delivery] = []
+        self._sent: list[tuple[float, bytes, float]] = []  # start on the wire, bytes, held back by a fault
         self._pending = sorted((f for f in faults.servos), key=lambda f: f.start)
         self._revivals: list[tuple[float, int]] = []
 
@@ -161,7 +163,7 @@ class VirtualBus:
     # The host's side.
 
     def send(self, data: bytes, baud: int) -> None:
-        """Host writes bytes at a bit rate [bit/s]: the clock advances by their time on the wire, replies are queued."""
+        """Host writes bytes at a bit rate [bit/s]: the clock passes their wire time, replies are queued."""
         self.ledger.instruction_bytes += len(data)
         self.ledger.usb += self.timing.usb
         self._pass(self.time + self.timing.usb)
@@ -179,6 +181,7 @@ class VirtualBus:
                     if isinstance(packet, Packet) and not packet.is_status:
                         self.ledger.instructions += 1
                         end = max(end, self._answer(packet, baud))
+                        self._deliver(baud)
         self._pass(start + len(data) * BITS_PER_BYTE / baud)
 
     def _pass(self, time: float) -> None:
@@ -209,7 +212,7 @@ class VirtualBus:
     # The servos' side.
 
     def _answer(self, packet: Packet, baud: int) -> float:
-        """Let the servos execute an instruction and put their replies on the wire; when the line is free again."""
+        """Let the servos execute an instruction and reply; the time when the line is free again."""
         hearing = [s for s in self.servos if s.awake and s.baud == baud]
         for servo in hearing:
             servo.feed()
@@ -278,21 +281,36 @@ class VirtualBus:
         end = start + len(frame) * BITS_PER_BYTE / baud
         if not self.faults.unplugged(start):
             for delay, piece in self.dice.apply(frame, frame[4], "status", start):
-                self._deliver(piece, start + delay, baud, delay)
+                self._sent.append((start + delay, piece, delay))
         return end
 
-    def _deliver(self, piece: bytes, start: float, baud: int, held: float) -> None:
-        """Queue bytes for the host: full USB packets as they fill, the rest after the latency timer."""
-        size = self.timing.packet
-        if self.timing.latency_timer == 0:
-            self._queue(piece, start + len(piece) * BITS_PER_BYTE / baud, held)
-            return
-        for place in range(0, len(piece), size):
-            part = piece[place : place + size]
-            end = start + (place + len(part)) * BITS_PER_BYTE / baud
-            wait = self.timing.latency_timer if len(part) < size else 0.0
-            self.ledger.latency += wait
-            self._queue(part, end + wait, held)
+    def _deliver(self, baud: int) -> None:
+        """Queue what the servos sent: full USB packets as they fill, the rest when the latency timer ends.
+
+        The timer starts with the first byte that waits.
+        """
+        pieces, self._sent = sorted(self._sent, key=lambda p: p[0]), []
+        timer = self.timing.latency_timer
+        byte = BITS_PER_BYTE / baud
+        waiting, deadline, last = bytearray(), 0.0, 0.0
+        for start, data, held in pieces:
+            if timer == 0 or held:
+                self._queue(data, start + len(data) * byte + timer, held)
+                continue
+            for i, value in enumerate(data, 1):
+                last = start + i * byte
+                if waiting and last > deadline:
+                    self._queue(bytes(waiting), deadline, 0.0)
+                    waiting.clear()
+                if not waiting:
+                    deadline = last + timer
+                waiting.append(value)
+                if len(waiting) == self.timing.packet:
+                    self._queue(bytes(waiting), last, 0.0)
+                    waiting.clear()
+        if waiting:
+            self._queue(bytes(waiting), deadline, 0.0)
+            self.ledger.latency += deadline - last
 
     def _queue(self, data: bytes, time: float, held: float) -> None:
         if data:

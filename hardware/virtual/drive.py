@@ -1,8 +1,9 @@
 """The control loops of a servo: from goals and gains to voltage, current and motion.
 
-Source: e-manual, block diagrams of Operating Mode (11) and the gain registers (KpP = P/128, KpD = D/16, KpI = I/65536,
-KvP = P/128, KvI = I/65536, output in counts of PWM each millisecond). Feedforward gains are kept but have no effect.
-Positions are the servo's own: turned by the reverse mode, shifted by the homing offset.
+Source: e-manual, block diagrams of Operating Mode (11) and the gain registers (KpP = P/128, KpD = D/16, KpI
+    = I/65536, KvP = P/128, KvI = I/65536, output in counts of PWM each millisecond). Feedforward gains are
+    kept but have no effect. Positions are the servo's own: turned by the reverse mode, shifted by the
+    homing offset.
 """
 
 from __future__ import annotations

@@ -21,11 +21,11 @@ class WireFault:
     """Packets that suffer on the wire.
 
     Args:
-        kind: lost (never arrives), late (by `delay`), truncated (its end is missing), corrupted (a flipped bit),
-            duplicated (comes twice) or noise (stray bytes before it).
+        kind: lost (never arrives), late (by `delay`), truncated (its end is missing), corrupted (a flipped
+            bit), duplicated (comes twice) or noise (stray bytes before it).
         probability: Of each packet that matches.
-        direction: Packets to the servos, from them, or both. A lost instruction is heard by no servo; a lost status
-            was heard by the other servos, so that a chain of replies goes on.
+        direction: Packets to the servos, from them, or both. A lost instruction is heard by no servo; a
+            lost status was heard by the other servos, so that a chain of replies goes on.
         servo: Only packets with this ID; None for all. Broadcast instructions have ID 254.
         start, stop: Only in this span of bus time [s].
         delay: Of a late packet [s].
@@ -56,7 +56,7 @@ class WireFault:
 
 @dataclass(frozen=True)
 class ServoFault:
-    """Something that happens to one servo at a time [s]: dead until `stop`, or a hardware error that latches."""
+    """What happens to one servo at a time [s]: dead until `stop`, or a hardware error that latches."""
 
     kind: Upset
     servo: int

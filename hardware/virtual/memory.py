@@ -9,8 +9,8 @@ from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register
 class Memory:
     """Control table of one servo as bytes.
 
-    `get` and `put` are the servo's own, unchecked access by name; `read` and `write` are the host's, by address,
-    through indirect registers, with the rules of the protocol.
+    `get` and `put` are the servo's own, unchecked access by name; `read` and `write` are the host's, by
+    address, through indirect registers, with the rules of the protocol.
     """
 
     def __init__(self, table: ControlTable) -> None:

@@ -1,8 +1,8 @@
 """The motor behind the registers: a DC motor with first-order current, and the mechanics it drives.
 
-Winding (output side of the gear): tau_e di/dt = (u - ke * speed) / R - i, torque = kt * i. Stall torque, stall current
-and no-load speed come from the specification table of the manual page; what the manual does not state is an
-assumption, named as such below.
+Winding (output side of the gear): tau_e di/dt = (u - ke * speed) / R - i, torque = kt * i. Stall torque,
+stall current and no-load speed come from the specification table of the manual page; what the manual does
+not state is an assumption, named as such below.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Plant(Protocol):
 
 
 class Gear:
-    """The servo alone with an inertia on its horn: rigid, Coulomb friction, optional backlash and outer torque.
+    """The servo alone with an inertia on its horn: Coulomb friction, optional backlash and outer torque.
 
     Args:
         inertia: Gear and load [kg*m^2].
@@ -145,7 +145,7 @@ class Gear:
         self.velocity = velocity
 
     def step(self, dt: float, torque: float) -> tuple[float, float]:
-        """Semi-implicit Euler; friction takes at most the momentum there is, so that the shaft can stand still."""
+        """Semi-implicit Euler; friction takes at most the momentum there is, so that the shaft can rest."""
         if self.load is not None:
             torque += self.load(self.position, self.velocity)
         v = self.velocity + dt * torque / self.inertia
@@ -198,8 +198,8 @@ def joints(step: GroupStep, position: Sequence[float], velocity: Sequence[float]
         step: (dt [s], torques [N*m]) -> positions [rad] and velocities [rad/s], one for each joint.
         position, velocity: State at the start.
 
-    Every servo must be on one bus, which advances them in turn; a joint sees the others' motion one control period
-    (1 ms) late.
+    Every servo must be on one bus, which advances them in turn; a joint sees the others' motion one control
+    period (1 ms) late.
     """
     group = _Group(step, (position, velocity))
     return [_Joint(group, i) for i in range(len(position))]

@@ -1,4 +1,4 @@
-"""In-memory serial port with a virtual clock, under the unmodified packet handler and group classes of dynamixel_sdk."""
+"""In-memory serial port with a virtual clock, under the unmodified packet classes of dynamixel_sdk."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ IDLE_POLL = 1e-5  # s of virtual time that an empty read takes while nothing is 
 class MemoryPort:
     """Stands in for `dynamixel_sdk.PortHandler`: same methods and attributes, no device, no sleeping.
 
-    Reading while no byte has arrived moves the bus clock to the next byte, or past the SDK's timeout, whichever comes
-    first; so a timeout of 35 ms costs microseconds of real time and a run is the same every time.
+    Reading while no byte has arrived moves the bus clock to the next byte, or past the SDK's timeout,
+    whichever comes first; so a timeout of 35 ms costs microseconds of real time and a run is the same every
+    time.
 
     Args:
         bus: The servos.
         baudrate: Bit rate [bit/s].
 
     Raises:
-        BusError: on read or write while the cable is pulled (as pyserial's SerialException) or the port is closed.
+        BusError: on read or write while the cable is pulled (as pyserial's SerialException) or the port is
+            closed.
     """
 
     def __init__(self, bus: VirtualBus, baudrate: int = 1_000_000, *, port_name: str = "memory") -> None:
@@ -41,28 +43,28 @@ class MemoryPort:
 
     # Names and behaviour of dynamixel_sdk.PortHandler.
 
-    def openPort(self) -> bool:  # noqa: N802
+    def openPort(self) -> bool:
         """Open at the present bit rate."""
         return self.setBaudRate(self.baudrate)
 
-    def closePort(self) -> None:  # noqa: N802
+    def closePort(self) -> None:
         """Close; reading and writing raise until it is opened again."""
         self.is_open = False
 
-    def clearPort(self) -> None:  # noqa: N802
+    def clearPort(self) -> None:
         """Forget bytes that have arrived; those still on the wire will come."""
         self._pull()
         self._received.clear()
 
-    def setPortName(self, port_name: str) -> None:  # noqa: N802
+    def setPortName(self, port_name: str) -> None:
         """Name for messages."""
         self.port_name = port_name
 
-    def getPortName(self) -> str:  # noqa: N802
+    def getPortName(self) -> str:
         """Name for messages."""
         return self.port_name
 
-    def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802
+    def setBaudRate(self, baudrate: int) -> bool:
         """Set the bit rate [bit/s] and open; False for one that the SDK does not know."""
         if baudrate not in SDK_BAUD_RATES:
             return False
@@ -72,16 +74,16 @@ class MemoryPort:
         self._received.clear()
         return True
 
-    def getBaudRate(self) -> int:  # noqa: N802
+    def getBaudRate(self) -> int:
         """Bit rate [bit/s]."""
         return self.baudrate
 
-    def getBytesAvailable(self) -> int:  # noqa: N802
+    def getBytesAvailable(self) -> int:
         """Bytes that have arrived."""
         self._pull()
         return len(self._received)
 
-    def readPort(self, length: int) -> bytes:  # noqa: N802
+    def readPort(self, length: int) -> bytes:
         """At most `length` bytes; when none has arrived, the clock moves on."""
         self._check()
         self._pull()
@@ -92,34 +94,34 @@ class MemoryPort:
         del self._received[:length]
         return data
 
-    def writePort(self, packet: bytes | list[int]) -> int:  # noqa: N802
+    def writePort(self, packet: bytes | list[int]) -> int:
         """Send bytes; the clock advances by their time on the wire."""
         self._check()
         data = bytes(packet)
         self.bus.send(data, self.baudrate)
         return len(data)
 
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+    def setPacketTimeout(self, packet_length: int) -> None:
         """As the SDK: time on the wire of a packet, plus twice the latency timer, plus 2 ms."""
         self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + SDK_LATENCY_MS * 2.0 + 2.0)
 
-    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
+    def setPacketTimeoutMillis(self, msec: float) -> None:
         """Start a timeout [ms]."""
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = msec
 
-    def isPacketTimeout(self) -> bool:  # noqa: N802
+    def isPacketTimeout(self) -> bool:
         """Whether the timeout has passed; then it is cleared."""
         if self.getTimeSinceStart() > self.packet_timeout:
             self.packet_timeout = 0.0
             return True
         return False
 
-    def getCurrentTime(self) -> float:  # noqa: N802
+    def getCurrentTime(self) -> float:
         """Virtual time [ms]."""
         return self.bus.time * 1000.0
 
-    def getTimeSinceStart(self) -> float:  # noqa: N802
+    def getTimeSinceStart(self) -> float:
         """Since the timeout was started [ms]."""
         return self.getCurrentTime() - self.packet_start_time
 

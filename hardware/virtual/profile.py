@@ -1,8 +1,8 @@
-"""Velocity profiles of the servo: closed-form piecewise-constant acceleration from the present motion to the goal.
+"""Velocity profiles of the servo: closed-form, piecewise constant acceleration from here to the goal.
 
-Source: e-manual, Profile Acceleration (108) and Profile Velocity (112), "What is the Profile": step, rectangular,
-triangular and trapezoidal, with velocity override (a new goal starts from the velocity of the running profile).
-Units are the caller's, any length and second; Pantograph uses rad.
+Source: e-manual, Profile Acceleration (108) and Profile Velocity (112), "What is the Profile": step,
+    rectangular, triangular and trapezoidal, with velocity override (a new goal starts from the velocity of
+    the running profile). Units are the caller's, any length and second; Pantograph uses rad.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def step(goal: float) -> Profile:
 def trapezoid(x: float, v: float, goal: float, *, speed: float = inf, acceleration: float = inf) -> Profile:
     """Fastest motion from (x, v) to rest at the goal within a speed and an acceleration, both positive.
 
-    An infinite speed is a step, an infinite acceleration a rectangular profile. A start too fast, or in the wrong
-    direction, brakes first.
+    An infinite speed is a step, an infinite acceleration a rectangular profile. A start too fast, or in the
+    wrong direction, brakes first.
     """
     if speed == inf:
         return step(goal)
@@ -88,10 +88,10 @@ def trapezoid(x: float, v: float, goal: float, *, speed: float = inf, accelerati
 
 
 def timed(x: float, v: float, goal: float, *, duration: float, ramp: float) -> Profile:
-    """Time-based profile: arrive after `duration` seconds, speeding up and slowing down for `ramp` seconds each.
+    """Time-based profile: arrive after `duration` seconds, of which `ramp` to speed up and to slow down.
 
-    The ramp is at most half of the duration (manual). From rest the peak speed is way / (duration - ramp); from a
-    velocity v the first ramp leads from v to the peak.
+    The ramp is at most half of the duration (manual). From rest the peak speed is way / (duration - ramp);
+    from a velocity v the first ramp leads from v to the peak.
     """
     if duration <= 0:
         return step(goal)
@@ -107,7 +107,7 @@ def timed(x: float, v: float, goal: float, *, duration: float, ramp: float) -> P
 def ramp_to(
     x: float, v: float, target: float, *, acceleration: float = inf, duration: float = 0.0
 ) -> Profile:
-    """Velocity mode: change to the target velocity with an acceleration, or within a duration when one is given."""
+    """Velocity mode: change to the target velocity with an acceleration, or within a duration if given."""
     if duration > 0:
         acceleration = abs(target - v) / duration or inf
     if acceleration == inf or target == v:

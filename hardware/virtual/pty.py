@@ -1,8 +1,8 @@
 """A pseudo-terminal that any program opens as a serial port, with virtual servos behind it, in real time.
 
 What dynamixel_sdk's PortHandler needs of it: opening at any rate of its list (the rate is read back from the
-terminal's settings, so that a wrong one meets silence), FIONREAD, TCFLUSH and raw bytes. RTS, CTS and the low-latency
-ioctl do not exist on a pseudo-terminal. Wire time is kept in the ledger, never slept.
+terminal's settings, so that a wrong one meets silence), FIONREAD, TCFLUSH and raw bytes. RTS, CTS and the
+low-latency ioctl do not exist on a pseudo-terminal. Wire time is kept in the ledger, never slept.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import termios
 import threading
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -156,10 +157,8 @@ class PtyServer:
             return b""
 
     def _write(self, data: bytes) -> None:
-        try:
+        with suppress(BlockingIOError):  # nobody reads: a serial buffer overflows in the same way
             os.write(self._master, data)
-        except BlockingIOError:
-            pass  # nobody reads: a serial buffer overflows in the same way
 
 
 def serve(bus: VirtualBus, *, link: str | Path | None = None) -> PtyServer:

@@ -1,20 +1,21 @@
 """A virtual servo: control table, instructions and protection around a drive.
 
-Behaviour follows the e-manual pages of the X series; where they are silent or the notes of users disagree, the choice
-is an argument of `Quirks` and set to the harsher case.
+Behaviour follows the e-manual pages of the X series; where they are silent or the notes of users disagree,
+the choice is an argument of `Quirks` and set to the harsher case.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, pi
+from math import inf
 
 from ..errors import HardwareError
 from ..packets import ALERT, BROADCAST, Instruction, Packet, StatusError, status
 from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register, control_table
-from ..tables.rows import ACCELERATION, CENTRE, POSITION, PWM, VELOCITY
+from ..tables.rows import POSITION, VELOCITY
 from . import drive as d
-from .drive import PERIOD, Drive, Settings, position_gains, velocity_gains, within_one_turn
+from .drive import PERIOD, Drive, within_one_turn
+from .mapping import counts, report, settings
 from .memory import Memory
 from .motor import MOTORS, Gear, Motor, Plant
 
@@ -29,7 +30,8 @@ class Quirks:
     """What the manual leaves open.
 
     Args:
-        goal_survives_torque_off: At torque-on the servo goes to the old goal (True, the dangerous case) or holds.
+        goal_survives_torque_off: At torque-on the servo goes to the old goal (True, the dangerous case) or
+            holds.
         goal_limit_error: Answer to a goal position outside of the position limits.
         boot_time: Silence after a reboot [s].
         overload_ratio, overload_time: Overload is this part of the stall current for this long [s].
@@ -71,7 +73,7 @@ class VirtualServo:
         firmware: int | None = None,
         supply: float | None = None,
         ambient: float = 25.0,
-        quirks: Quirks = Quirks(),  # noqa: B008 - frozen
+        quirks: Quirks = Quirks(),
         registers: dict[str, int] | None = None,
     ) -> None:
         self.table: ControlTable = control_table(model)
@@ -237,7 +239,7 @@ class VirtualServo:
         if self.table.has_current:
             memory.put("goal_current", 0 if mode == d.CURRENT_MODE else memory.get("current_limit"))
         memory.put("goal_velocity", 0)
-        memory.put("goal_position", self._counts(self.drive.position))
+        memory.put("goal_position", counts(self.drive.position))
         self._apply_settings()
         self.drive.hold()
 
@@ -257,31 +259,10 @@ class VirtualServo:
     # From registers to the drive.
 
     def _apply_settings(self) -> None:
-        get = self.memory.get
-        s = self.drive.settings
-        mode, drive_mode = get("operating_mode"), get("drive_mode")
-        timed = bool(drive_mode & 4)
-        watchdog = get("bus_watchdog")
+        """Let the drive follow the registers; called after every change of one."""
+        watchdog = self.memory.get("bus_watchdog")
         self._watchdog_period = watchdog * 0.02 if watchdog > 0 else 0.0
-        speed, acceleration = get("profile_velocity"), get("profile_acceleration")
-        self.drive.settings = Settings(
-            mode=mode,
-            torque=bool(get("torque_enable")) and not self.dead,
-            reverse=s.reverse,
-            time_based=timed,
-            position_gains=position_gains(
-                get("position_p_gain"), get("position_i_gain"), get("position_d_gain")
-            ),
-            velocity_gains=velocity_gains(get("velocity_p_gain"), get("velocity_i_gain")),
-            pwm_goal=get("goal_pwm") * PWM,
-            current_goal=get("goal_current") * self.table["goal_current"].scale
-            if self.table.has_current
-            else inf,
-            velocity_goal=get("goal_velocity") * VELOCITY,
-            position_goal=(get("goal_position") - CENTRE) * POSITION,
-            profile_velocity=speed * 1e-3 if timed else speed * VELOCITY,
-            profile_acceleration=acceleration * 1e-3 if timed else acceleration * ACCELERATION,
-        )
+        self.drive.settings = settings(self.memory, reverse=self.drive.settings.reverse)
 
     def _torque(self, on: bool) -> None:
         if on and self._latched & self.memory.get("shutdown"):
@@ -294,21 +275,19 @@ class VirtualServo:
             self._fed = self.time
             self.drive.hold()
             if not self.quirks.goal_survives_torque_off:
-                self.memory.put("goal_position", self._counts(self.drive.position))
+                self.memory.put("goal_position", counts(self.drive.position))
             self._apply_settings()
             if not self.drive.halted:
                 self.drive.plan()
         self._apply_settings()
-
-    def _counts(self, angle: float) -> int:
-        return round(angle / POSITION) + CENTRE
 
     # Instructions.
 
     def execute(self, packet: Packet) -> Packet | None:
         """Carry out an instruction for this servo; the reply, or None when there is none.
 
-        Sync and bulk instructions, whose replies form a chain, are the bus's; it calls `write` and `reply_to_read`.
+        Sync and bulk instructions, whose replies form a chain, are the bus's; it calls `write` and
+        `reply_to_read`.
         """
         silent = packet.id != self.id
         shadow = self._is_shadow(packet.id)
@@ -347,6 +326,11 @@ class VirtualServo:
 
     def _error_byte(self, error: StatusError) -> int:
         return error | (ALERT if self._latched else 0)
+
+    def _refresh(self) -> None:
+        if self._fresh != self.time:
+            self._fresh = self.time
+            report(self.memory, self.drive, self.time)
 
     def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
         """Bytes as the host reads them."""
@@ -411,7 +395,7 @@ class VirtualServo:
             self._apply_settings()
 
     def _resume(self) -> None:
-        self.memory.put("goal_position", self._counts(self.drive.position))
+        self.memory.put("goal_position", counts(self.drive.position))
         self._apply_settings()
         self.drive.resume()
 
@@ -471,7 +455,7 @@ class VirtualServo:
         if self.get("moving"):
             return StatusError.RESULT_FAIL
         self._reset_turns()
-        self.memory.put("goal_position", self._counts(self.drive.position))
+        self.memory.put("goal_position", counts(self.drive.position))
         self._apply_settings()
         self.drive.hold()
         return StatusError.NONE
@@ -502,49 +486,6 @@ class VirtualServo:
             self.memory.bytes[:FIRST_RAM_ADDRESS] = self._backup
             self._reboot()
         return StatusError.NONE
-
-    # From the drive to registers.
-
-    def _refresh(self) -> None:
-        """Bring the read-only registers up to date with the drive."""
-        if self._fresh == self.time:
-            return
-        self._fresh = self.time
-        drive, put = self.drive, self.memory.put
-        position, velocity = drive.position, drive.velocity
-        target, target_velocity = drive.target
-        counts = self._counts(position)
-        put("realtime_tick", round(self.time * 1000) % 32_768)
-        put("present_position", counts)
-        put("present_velocity", round(velocity / VELOCITY))
-        put("position_trajectory", self._counts(target))
-        put("velocity_trajectory", round(target_velocity / VELOCITY))
-        put("present_pwm", round(drive.pwm / PWM))
-        put("present_input_voltage", round(drive.voltage * 10))
-        put("present_temperature", round(drive.temperature))
-        if self.table.has_current:
-            put("present_current", round(drive.current / self.table["present_current"].scale))
-        else:
-            put("present_load", round(1000 * drive.current / drive.motor.stall_current))
-        self._refresh_moving(counts, velocity)
-
-    def _refresh_moving(self, counts: int, velocity: float) -> None:
-        drive, memory = self.drive, self.memory
-        s = drive.settings
-        threshold = memory.get("moving_threshold")
-        ongoing = s.torque and s.mode in d.POSITION_MODES and drive.elapsed < drive.trajectory.duration
-        memory.put("moving", int(ongoing or abs(velocity) > threshold * VELOCITY))
-        value = 0
-        if s.mode in d.POSITION_MODES and s.torque:
-            goal = memory.get("goal_position")
-            value = drive.trajectory.kind | (0x02 if ongoing else 0)
-            value |= 0x01 if abs(goal - counts) <= IN_POSITION else 0
-            value |= 0x08 if abs(drive.target[0] - drive.position) > FOLLOWING_ERROR else 0
-        memory.put("moving_status", value)
-
-
-IN_POSITION = 20  # counts: the threshold that the SDK's examples call arrived
-FOLLOWING_ERROR = pi / 18  # rad
 
 
 def _word(data: bytes, place: int) -> int:
