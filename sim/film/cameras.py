@@ -124,13 +124,12 @@ class Camera:
         travel = float(np.linalg.norm(np.ptp(middle, axis=0)))
         direction = np.array([0.62, -1.0, 0.42])
         direction /= np.linalg.norm(direction)
-        if travel > 3 * size:
-            body = _moving_root(model)
-            distance = _distance(low[0] - middle[0], high[0] - middle[0], direction, aspect)
-            return cls("auto", "tracking", position=1.15 * distance * direction, frame=body)
-        low_all, high_all = low.min(axis=0), high.max(axis=0)
-        centre = (low_all + high_all) / 2
-        distance = _distance(low_all - centre, high_all - centre, direction, aspect)
+        body = _moving_root(model)
+        if travel > 3 * size and body:
+            distance = max(_distance(low - middle, high - middle, direction, aspect), 1e-3)
+            return cls("auto", "tracking", position=1.2 * distance * direction, frame=body)
+        centre = (low.min(axis=0) + high.max(axis=0)) / 2
+        distance = _distance(low - centre, high - centre, direction, aspect)
         return cls("auto", "fixed", position=centre + distance * direction, target=centre)
 
     def _angle(self, t: float, default: float) -> float:
@@ -170,7 +169,7 @@ class Camera:
 
 
 def look_at(position: ArrayLike, target: ArrayLike, *, roll: float = 0.0) -> Floats:
-    """Pose X_WC (4, 4) at `position` looking at `target` along -z, world z up (world y when looking along z)."""
+    """Pose X_WC (4, 4) at `position` looking at `target` along -z, world z up (y when looking along z)."""
     eye = np.asarray(position, dtype=float)
     back = eye - np.asarray(target, dtype=float)
     back /= np.linalg.norm(back)
@@ -213,13 +212,10 @@ def motion_boxes(model: mujoco.MjModel, q: Floats, *, most: int = 64) -> tuple[F
 
 
 def _distance(low: Floats, high: Floats, direction: Floats, aspect: float) -> float:
-    """How far along `direction` from the box's middle a camera stands that sees the box with a margin."""
-    corners = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    )
-    R_WC = look_at(direction, np.zeros(3))[:3, :3]
-    in_camera = corners @ R_WC
-    slope = np.tan(_FOVY / 2) * 0.86
+    """How far along `direction` from the origin a camera stands that sees the boxes (k, 3) with a margin."""
+    corners = np.concatenate([np.where(pick, high, low) for pick in np.ndindex(2, 2, 2)])
+    in_camera = corners @ look_at(direction, np.zeros(3))[:3, :3]
+    slope = 0.9 * np.tan(_FOVY / 2)
     needed = np.maximum(np.abs(in_camera[:, 0]) / (slope * aspect), np.abs(in_camera[:, 1]) / slope)
     return max(float(np.max(needed + in_camera[:, 2])), 1e-3)
 

@@ -16,10 +16,21 @@ _UNSET_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's mark for "the material's colour"
 
 
 @dataclass(frozen=True)
+class Checker:
+    """Squares of two display colours, two by two to the image, and lines of a third along its edges.
+
+    `edge`: half the width of the lines, as a fraction of the image.
+    """
+
+    colors: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+    edge: float = 0.0
+
+
+@dataclass(frozen=True)
 class Material:
     """Look of a batch: display RGBA, Blinn-Phong constants, and the texture with its mapping.
 
-    A 2d texture is read at `uv * uv_scale + uv_offset`, a cube texture in the direction of the point in the
+    A 2d texture is read at `uv * uv_scale`, a cube texture in the direction of the point in the
     geom's frame times `cube_scale`.
     """
 
@@ -29,8 +40,8 @@ class Material:
     emission: float
     texture: int
     uv_scale: tuple[float, float]
-    uv_offset: tuple[float, float]
     cube_scale: tuple[float, float, float]
+    checker: Checker | None = None
 
 
 @dataclass(frozen=True)
@@ -106,46 +117,81 @@ def _rgba(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]
 def _material(model: mujoco.MjModel, geom: int) -> Material:
     index = int(model.geom_matid[geom])
     rgba = _rgba(model, geom)
-    if index < 0:
-        return Material(rgba, 0.5, 64.0, 0.0, -1, (1.0, 1.0), (0.0, 0.0), (1.0, 1.0, 1.0))
-    roles = mujoco.mjtTextureRole
-    texture = max(
-        int(model.mat_texid[index, roles.mjTEXROLE_RGB]), int(model.mat_texid[index, roles.mjTEXROLE_RGBA])
+    specular, exponent, emission, texture = 0.5, 64.0, 0.0, -1
+    scale, cube = (1.0, 1.0), (1.0, 1.0, 1.0)
+    if index >= 0:
+        specular, emission = float(model.mat_specular[index]), float(model.mat_emission[index])
+        exponent = max(1.0, 128.0 * float(model.mat_shininess[index]))
+        roles = mujoco.mjtTextureRole
+        texture = max(
+            int(model.mat_texid[index, int(r)]) for r in (roles.mjTEXROLE_RGB, roles.mjTEXROLE_RGBA)
+        )
+        scale, cube = _mapping(model, geom, index)
+    checker = _checker_of(model, texture) if texture >= 0 else None
+    if texture < 0 and int(model.geom_type[geom]) == mujoco.mjtGeom.mjGEOM_PLANE:
+        # A bare floor gets faint squares: without them nobody sees what moves over it, or how far.
+        checker = Checker(((1.0, 1.0, 1.0), (0.9, 0.9, 0.9), (1.0, 1.0, 1.0)))
+        x, y = (float(s) or 1.0 for s in model.geom_size[geom][:2])
+        scale = (x / _square(model), y / _square(model))
+    return Material(rgba, specular, exponent, emission, texture, scale, cube, checker)
+
+
+def _square(model: mujoco.MjModel) -> float:
+    """Side in metres of a bare floor's squares: 1, 2 or 5 times a power of ten, about a third of the model."""
+    third = max(float(model.stat.extent), 1e-6) / 3
+    power = 10.0 ** np.floor(np.log10(third))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= third * (1 + 1e-9)))
+
+
+def _checker_of(model: mujoco.MjModel, texture: int) -> Checker | None:
+    """The checker that an image is, if it is one: drawn as a formula it stays sharp and free of moire."""
+    if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D or model.tex_nchannel[texture] < 3:
+        return None
+    pixels = texture_pixels(model, texture)[:, :, :3]
+    h, w = pixels.shape[:2]
+    squares = np.where(
+        ((np.arange(h) * 2 // h)[:, None] == np.arange(w) * 2 // w)[..., None],
+        pixels[h // 4, w // 4],
+        pixels[h // 4, w - 1 - w // 4],
     )
-    scale, offset, cube = _mapping(model, geom, index)
-    return Material(
-        rgba,
-        float(model.mat_specular[index]),
-        max(1.0, 128.0 * float(model.mat_shininess[index])),
-        float(model.mat_emission[index]),
-        texture,
-        scale,
-        offset,
-        cube,
-    )
+    for edge in range(min(4, h // 4, w // 4)):
+        inner = np.s_[edge : h - edge, edge : w - edge]
+        framed = np.tile(pixels[0, 0], (h, w, 1)) if edge else squares.copy()
+        framed[inner] = squares[inner]
+        if np.abs(framed.astype(int) - pixels).max() <= 1:
+            first, second, line = (
+                tuple(float(x) / 255 for x in color)
+                for color in (squares[h // 4, w // 4], squares[h // 4, w - 1 - w // 4], pixels[0, 0])
+            )
+            return Checker((first, second, line), edge / w)
+    return None
+
+
+def texture_pixels(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
+    """A texture of the model as (height, width, channels); the six sides of a cube are stacked downwards."""
+    width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
+    channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+    data = model.tex_data[start : start + width * height * channels]
+    return np.asarray(data, dtype=np.uint8).reshape(height, width, channels)
 
 
 def _mapping(
     model: mujoco.MjModel, geom: int, material: int
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float]]:
-    """MuJoCo's texture mapping (its render_gl3.c): 2d over x and y, cube along the point's direction.
+) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Scales of the 2d coordinates and of the cube's direction, found from pictures that MuJoCo draws.
 
-    `texuniform` counts repeats per two metres for 2d textures, and maps cubes on the unit shape.
+    2d: `texrepeat` images over each face; with `texuniform`, that many over two metres. Cube: the direction
+    of the point on the unit shape; with `texuniform`, of the point itself.
     """
     repeat_x, repeat_y = (float(x) for x in model.mat_texrepeat[material])
     uniform = bool(model.mat_texuniform[material])
-    kind = int(model.geom_type[geom])
-    size = np.array(model.geom_size[geom])
     types = mujoco.mjtGeom
-    if kind in (types.mjGEOM_MESH, types.mjGEOM_SDF):
-        if model.mesh_texcoordadr[int(model.geom_dataid[geom])] >= 0:
-            return (repeat_x, repeat_y), (0.0, 0.0), (1.0, 1.0, 1.0)
-        size = np.ones(3)
-    elif kind == types.mjGEOM_HFIELD:
-        size = np.array(model.hfield_size[int(model.geom_dataid[geom])][:3])
-    elif kind in (types.mjGEOM_SPHERE, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
-        size = np.array([size[0], size[0], size[0] if kind == types.mjGEOM_SPHERE else size[1]])
-    spans = np.where(size > 0, size, 1.0)
-    per_x, per_y = (1.0, 1.0) if uniform else (1.0 / spans[0], 1.0 / spans[1])
-    cube = tuple(float(x) for x in 1.0 / spans) if uniform else (1.0, 1.0, 1.0)
-    return (0.5 * repeat_x * per_x, -0.5 * repeat_y * per_y), (-0.5, -0.5), (cube[0], cube[1], cube[2])
+    kind = int(model.geom_type[geom])
+    x, y, z = (float(s) for s in model.geom_size[geom])
+    if kind in (types.mjGEOM_SPHERE, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
+        x, y, z = x, x, x if kind == types.mjGEOM_SPHERE else y
+    if kind in (types.mjGEOM_MESH, types.mjGEOM_SDF, types.mjGEOM_HFIELD):
+        return (repeat_x, repeat_y), (x, y, z) if uniform else (1.0, 1.0, 1.0)
+    x, y, z = x or 1.0, y or 1.0, z or 1.0
+    scale = (repeat_x * x, repeat_y * y) if uniform else (repeat_x, repeat_y)
+    return scale, (1.0, 1.0, 1.0) if uniform else (1 / x, 1 / y, 1 / z)

@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from .drawing import texture_pixels
+
 Floats = NDArray[np.floating]
 
 
@@ -172,9 +174,8 @@ def upload_texture(model: mujoco.MjModel, texture: int) -> tuple[str, int]:
     """Send a texture of the model to the current context with mipmaps; ("2d" or "cube", its id)."""
     from OpenGL import GL
 
-    width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
-    channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
-    pixels = model.tex_data[start : start + width * height * channels].reshape(height, width, channels)
+    pixels = texture_pixels(model, texture)
+    height, width, channels = pixels.shape
     kind = "2d" if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D else "cube"
     target = GL.GL_TEXTURE_2D if kind == "2d" else GL.GL_TEXTURE_CUBE_MAP
     layout = {1: GL.GL_RED, 2: GL.GL_RG, 3: GL.GL_RGB, 4: GL.GL_RGBA}[channels]
@@ -195,6 +196,4 @@ def upload_texture(model: mujoco.MjModel, texture: int) -> tuple[str, int]:
     wrap = GL.GL_REPEAT if kind == "2d" else GL.GL_CLAMP_TO_EDGE
     for axis in (GL.GL_TEXTURE_WRAP_S, GL.GL_TEXTURE_WRAP_T):
         GL.glTexParameteri(target, axis, wrap)
-    if kind == "2d":  # floors are seen at grazing angles, where isotropic mipmaps blur
-        GL.glTexParameterf(target, 0x84FE, 8.0)  # GL_TEXTURE_MAX_ANISOTROPY
     return kind, name

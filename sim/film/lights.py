@@ -82,6 +82,18 @@ class LitNow:
     exponent: float
     attenuation: tuple[float, float, float]
 
+    def power_at(self, place: Floats) -> float:
+        """Share of the radiance that arrives at `place`, shadows aside."""
+        if self.kind == "directional":
+            return 1.0
+        distance = float(np.linalg.norm(place - self.position))
+        c0, c1, c2 = self.attenuation
+        power = 1.0 / max(c0 + distance * (c1 + distance * c2), 1e-9)
+        if self.kind == "point":
+            return power
+        along = float((place - self.position) @ self.direction) / max(distance, 1e-9)
+        return power * along**self.exponent if along > self.cos_cutoff else 0.0
+
 
 def vector(value: ArrayLike | Curve, t: float, size: int, what: str) -> Floats:
     """A constant or a curve at time `t`, as `size` finite numbers. Raises FilmError naming `what`."""
@@ -103,9 +115,9 @@ def default_lights(center: ArrayLike, extent: float) -> tuple[Light, ...]:
         return Light(name, "directional", position, middle, color, intensity, shadow)
 
     return (
-        light("key", (0.45, -0.65, 1.0), (1.0, 0.97, 0.92), 0.75, True),
-        light("fill", (-0.9, -0.5, 0.45), (0.88, 0.94, 1.0), 0.16, False),
-        light("rim", (-0.2, 1.0, 0.6), (1.0, 1.0, 1.0), 0.22, False),
+        light("key", (-0.75, -0.5, 1.1), (1.0, 0.97, 0.92), 0.8, True),
+        light("fill", (1.0, -0.4, 0.45), (0.88, 0.94, 1.0), 0.2, False),
+        light("rim", (0.3, 1.0, 0.6), (1.0, 1.0, 1.0), 0.25, False),
     )
 
 

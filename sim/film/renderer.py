@@ -6,7 +6,7 @@ our own, since pyrender's general shader and per-node bookkeeping cost several t
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import mujoco
 import numpy as np
@@ -20,12 +20,14 @@ from .drawing import Batch, batches
 from .gl import Picture, Program, ShadowMap, upload_texture
 from .lights import Light, LitNow, default_lights, model_lights
 from .shadows import inverse, perspective, shadow_view
+from .surfaces import Surface
 
 Floats = NDArray[np.floating]
 
 BACKGROUND = ((0.80, 0.86, 0.92), (0.40, 0.56, 0.76), (0.62, 0.67, 0.73))  # at, above, below the horizon
 _AMBIENT = (np.array([0.20, 0.215, 0.24]), np.array([0.11, 0.105, 0.10]))  # linear, from above and below
 _SHADOW_SIZE = 1024
+_FULL = 1.15  # light that a model file's lamps give together
 _MOST_SHADOWS = 12  # texture units that every OpenGL 3.3 has, less those of the materials
 
 
@@ -61,15 +63,14 @@ class Renderer:
         self._tints = np.broadcast_to(tints, (3, 3))
         low, high = motion_boxes(model, model.qpos0[None])
         self._extent = max(float(np.linalg.norm(high - low)), float(model.stat.extent), 1e-3)
+        self._middle = (low + high)[0] / 2
         self._haze = (6 * self._extent, 25 * self._extent)
         self._batches, self.not_drawn = batches(model, plane_radius=1.5 * self._haze[1])
         self._solid = np.concatenate([[]] + [b.geoms for b in self._batches if not b.ground]).astype(int)
         casters = [b for b in self._batches if not b.ground and b.material.rgba[3] >= 0.5]
         self._casters = np.concatenate([[]] + [b.geoms for b in casters]).astype(int)
         own = bool(np.any(model.light_active)) if model.nlight else False
-        self._lights = (
-            default_lights((low + high)[0] / 2, self._extent) if lights is None and not own else lights
-        )
+        self._lights = default_lights(self._middle, self._extent) if lights is None and not own else lights
         self._shadows = shadows and len(self._casters) > 0
         self._context = Context()
         self._context.make_current()
@@ -88,21 +89,21 @@ class Renderer:
         self._context.close()
 
     def render(self, q: ArrayLike, t: float = 0.0, *, camera: Camera) -> NDArray[np.uint8]:
-        """The picture (height, width, 3) of configuration `q` (nq,) at time `t` (s), which keys the lights."""
+        """The picture (height, width, 3) of configuration `q` (nq,); time `t` (s) keys camera and lights."""
         X_WC, fovy = self._pose(q, t, camera)
-        lights, headlight = self._lights_at(t, X_WC)
-        X_WG = self._send_poses()
+        lights = self._lights_at(t, X_WC)
+        X_WG = self._send_poses(X_WC, fovy)
         maps = self._draw_shadow_maps(lights, X_WG)
         self._picture.begin(depth=False)
-        self._draw_forward(X_WC, fovy, lights, headlight, maps)
+        self._draw_forward(X_WC, fovy, lights, maps)
         return self._picture.colors()
 
     def depth(self, q: ArrayLike, t: float = 0.0, *, camera: Camera) -> NDArray[np.float32]:
         """Distance in metres along the line of sight's axis (height, width), infinite where nothing is."""
         X_WC, fovy = self._pose(q, t, camera)
-        self._send_poses()
+        self._send_poses(X_WC, fovy)
         self._picture.begin(depth=True)
-        self._draw_depth(self._all, self._view_projection(X_WC, fovy))
+        self._draw_depth([s for s, _ in self._surfaces], self._view_projection(X_WC, fovy))
         near, far = self._range
         buffer = self._picture.depths().astype(np.float64)
         with np.errstate(divide="ignore"):
@@ -132,59 +133,59 @@ class Renderer:
         self._range = (min(0.005 * self._extent, far / 100), far)
         return perspective(fovy, self.width / self.height, *self._range) @ inverse(X_WC)
 
-    def _lights_at(self, t: float, X_WC: Floats) -> tuple[list[LitNow], float]:
-        """The lights now, and the factor that keeps a model file's lights from washing out the picture."""
+    def _lights_at(self, t: float, X_WC: Floats) -> list[LitNow]:
         if self._lights is not None:
-            return [light.at(t) for light in self._lights], 1.0
+            return [light.at(t) for light in self._lights]
         lights = model_lights(self.model, self._data)
         if self.model.vis.headlight.active:
-            glow = np.asarray(self.model.vis.headlight.diffuse, dtype=float) ** 2
+            glow = 0.4 * np.asarray(self.model.vis.headlight.diffuse, dtype=float) ** 2
             lights.append(
                 LitNow("directional", X_WC[:3, 3], -X_WC[:3, 2], glow, False, 0.0, 1.0, (1.0, 0.0, 0.0))
             )
-        total = sum(float(light.radiance.max()) for light in lights)
-        return lights, min(1.0, 0.95 / total) if total > 0 else 1.0
+        return lights
+
+    def _exposure_of(self, lights: Sequence[LitNow], place: Floats) -> float:
+        """The factor by which a model file's lights together give full brightness at `place`.
+
+        MuJoCo adds display colours, so that files for it differ widely in how bright they are. Lights of the
+        scene are taken as they are.
+        """
+        if self._lights is not None:
+            return 1.0
+        total = sum(float(light.radiance.max()) * light.power_at(place) for light in lights)
+        return float(np.clip(_FULL / total, 0.4, 4.0)) if total > 0 else 1.0
 
     def _upload(self, casters: list[Batch]) -> None:
         """Send surfaces and textures, and compile the programs for this film's lights."""
         from OpenGL import GL
-        from pyrender import Primitive
 
         self._picture = Picture(self.width, self.height)
-        self._surfaces: list[tuple[Batch, Any, Any]] = []
         self._textures = {
             b.material.texture: upload_texture(self.model, b.material.texture)
             for b in self._batches
-            if b.material.texture >= 0
+            if b.material.texture >= 0 and b.material.checker is None
         }
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_comPos(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
-        lights, _ = self._lights_at(0.0, np.eye(4))
+        lights = self._lights_at(0.0, np.eye(4))
+        self._exposure = self._exposure_of(lights, self._middle)
         self._layout = self._shadow_layout(lights)
         self._maps = [ShadowMap(_SHADOW_SIZE) for _, index in self._layout if index >= 0]
         programs: dict[tuple[str, bool], Program] = {}
+        self._surfaces: list[tuple[Surface, Program]] = []
         for batch in self._batches:
-            shape = batch.shape
-            surface = Primitive(
-                positions=shape.positions,
-                normals=shape.normals,
-                texcoord_0=np.zeros((len(shape.positions), 2)) if shape.uv is None else shape.uv,
-                indices=shape.indices,
-                poses=np.tile(np.eye(4), (len(batch.geoms), 1, 1)),
-            )
-            surface._add_to_context()
-            texture = self._textures[batch.material.texture][0] if batch.material.texture >= 0 else "none"
-            key = (texture, batch.ground)
+            key = (self._texture_kind(batch), batch.ground)
             if key not in programs:
                 programs[key] = Program(
                     shaders.forward_vertex(len(self._maps)),
-                    shaders.forward_fragment(self._layout, texture=texture, ground=batch.ground),
+                    shaders.forward_fragment(self._layout, texture=key[0], ground=batch.ground),
                 )
-            self._surfaces.append((batch, surface, programs[key]))
+            surface = Surface(batch, self.model, pixel=self._extent / self.height)
+            self._surfaces.append((surface, programs[key]))
+        self._surfaces.sort(key=lambda s: s[0].batch.ground)  # what lies behind last: fewer hidden pixels
         self._programs = list(programs.values())
-        self._all = list(self._surfaces)
-        self._casting = [s for s in self._surfaces if any(s[0] is b for b in casters)]
+        self._casting = [s for s, _ in self._surfaces if any(s.batch is b for b in casters)]
         self._depth_program = Program(shaders.DEPTH_VERTEX, shaders.DEPTH_FRAGMENT)
         self._sky_program = Program(shaders.SKY_VERTEX, shaders.SKY_FRAGMENT)
         self._empty = GL.glGenVertexArrays(1)
@@ -201,20 +202,21 @@ class Renderer:
             )
         return layout
 
-    def _send_poses(self) -> NDArray[np.float32]:
-        """World poses of all geoms (ngeom, 4, 4), also sent to the instance buffers."""
-        from OpenGL import GL
+    def _texture_kind(self, batch: Batch) -> str:
+        if batch.material.checker is not None:
+            return "checker"
+        return self._textures[batch.material.texture][0] if batch.material.texture >= 0 else "none"
 
+    def _send_poses(self, X_WC: Floats, fovy: float) -> NDArray[np.float32]:
+        """World poses of all geoms (ngeom, 4, 4), also sent to the surfaces."""
         X_WG = np.zeros((self.model.ngeom, 4, 4), dtype=np.float32)
         X_WG[:, :3, :3] = self._data.geom_xmat.reshape(-1, 3, 3)
         X_WG[:, :3, 3] = self._data.geom_xpos
         X_WG[:, 3, 3] = 1
         columns = np.ascontiguousarray(X_WG.transpose(0, 2, 1))
-        for batch, surface, _ in self._surfaces:
-            part = columns[batch.geoms]
-            # pyrender reads `Primitive.poses` once, at the upload; its second buffer is the one in use.
-            GL.glBindBuffer(GL.GL_ARRAY_BUFFER, surface._buffers[1])
-            GL.glBufferSubData(GL.GL_ARRAY_BUFFER, 0, part.nbytes, part)
+        slope = 2 * np.tan(fovy / 2) / self.height
+        for surface, _ in self._surfaces:
+            surface.place(columns, X_WC[:3, 3], slope)
         return X_WG
 
     def _draw_shadow_maps(
@@ -240,7 +242,7 @@ class Renderer:
         GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
         return views
 
-    def _draw_depth(self, surfaces: list[tuple[Batch, Any, Any]], VP: Floats) -> None:
+    def _draw_depth(self, surfaces: Sequence[Surface], VP: Floats) -> None:
         from OpenGL import GL
 
         GL.glEnable(GL.GL_DEPTH_TEST)
@@ -248,15 +250,14 @@ class Renderer:
         GL.glDepthMask(True)
         GL.glUseProgram(self._depth_program.id)
         self._depth_program.set("view_projection", VP)
-        for batch, surface, _ in surfaces:
-            _draw(surface, len(batch.geoms))
+        for surface in surfaces:
+            surface.draw()
 
     def _draw_forward(
         self,
         X_WC: Floats,
         fovy: float,
         lights: Sequence[LitNow],
-        exposure: float,
         maps: list[tuple[Floats, float]],
     ) -> None:
         from OpenGL import GL
@@ -274,20 +275,20 @@ class Renderer:
         for program in self._programs:
             GL.glUseProgram(program.id)
             program.set("view_projection", VP)
-            self._light(program, X_WC[:3, 3], lights, exposure, maps)
-        solid = [s for s in self._surfaces if s[0].opaque]
-        for batch, surface, program in solid:
-            self._draw_batch(batch, surface, program)
+            self._light(program, X_WC[:3, 3], lights, maps)
+        for surface, program in self._surfaces:
+            if surface.batch.opaque:
+                self._draw_surface(surface, program)
         self._draw_sky(X_WC, fovy)
-        clear = [s for s in self._surfaces if not s[0].opaque]
+        clear = [s for s in self._surfaces if not s[0].batch.opaque]
         if clear:
             place = self._data.geom_xpos
-            clear.sort(key=lambda s: -float(np.linalg.norm(place[s[0].geoms[0]] - X_WC[:3, 3])))
+            clear.sort(key=lambda s: -float(np.linalg.norm(place[s[0].batch.geoms[0]] - X_WC[:3, 3])))
             GL.glEnable(GL.GL_BLEND)
             GL.glBlendFunc(GL.GL_SRC_ALPHA, GL.GL_ONE_MINUS_SRC_ALPHA)
             GL.glDepthMask(False)
-            for batch, surface, program in clear:
-                self._draw_batch(batch, surface, program)
+            for surface, program in clear:
+                self._draw_surface(surface, program)
             GL.glDepthMask(True)
 
     def _light(
@@ -295,7 +296,6 @@ class Renderer:
         program: Program,
         eye: Floats,
         lights: Sequence[LitNow],
-        exposure: float,
         maps: list[tuple[Floats, float]],
     ) -> None:
         """Write what holds for the whole picture to a forward program."""
@@ -303,12 +303,11 @@ class Renderer:
         program.set("ambient_above", _AMBIENT[0])
         program.set("ambient_below", _AMBIENT[1])
         program.set("haze", self._haze)
-        program.set("cell", max(10.0 ** np.floor(np.log10(self._extent)), 1e-3))
         self._tint(program)
         if lights:
             program.set("light_position", [light.position for light in lights])
             program.set("light_direction", [light.direction for light in lights])
-            program.set("light_radiance", [exposure * light.radiance for light in lights])
+            program.set("light_radiance", [self._exposure * light.radiance for light in lights])
             program.set("light_fade", [light.attenuation for light in lights])
             program.set("light_cone", [(light.cos_cutoff, light.exponent) for light in lights])
         program.sampler("image", 0)
@@ -321,19 +320,23 @@ class Renderer:
         for name, color in zip(("horizon", "zenith", "nadir"), self._tints, strict=True):
             program.set(name, color)
 
-    def _draw_batch(self, batch: Batch, surface: Any, program: Program) -> None:
+    def _draw_surface(self, surface: Surface, program: Program) -> None:
         from OpenGL import GL
 
-        look = batch.material
+        look = surface.batch.material
         GL.glUseProgram(program.id)
         program.set("base", [*(np.array(look.rgba[:3]) ** 2), look.rgba[3]])
         program.set("surface", (look.specular, look.exponent, look.emission))
-        program.set("uv_map", (*look.uv_scale, *look.uv_offset))
+        program.set("uv_scale", look.uv_scale)
         program.set("cube_scale", look.cube_scale)
-        if look.texture >= 0:
+        if look.checker is not None:
+            for i, color in enumerate(look.checker.colors):
+                program.set(f"checker{i}", np.array(color) ** 2)
+            program.set("edge", look.checker.edge)
+        elif look.texture >= 0:
             kind, name = self._textures[look.texture]
             GL.glBindTexture(GL.GL_TEXTURE_2D if kind == "2d" else GL.GL_TEXTURE_CUBE_MAP, name)
-        _draw(surface, len(batch.geoms))
+        surface.draw()
 
     def _draw_sky(self, X_WC: Floats, fovy: float) -> None:
         from OpenGL import GL
@@ -347,10 +350,3 @@ class Renderer:
         self._tint(program)
         GL.glBindVertexArray(self._empty)
         GL.glDrawArrays(GL.GL_TRIANGLES, 0, 3)
-
-
-def _draw(surface: Any, count: int) -> None:
-    from OpenGL import GL
-
-    GL.glBindVertexArray(surface._vertex_array_id)
-    GL.glDrawElementsInstanced(GL.GL_TRIANGLES, surface.indices.size, GL.GL_UNSIGNED_INT, None, count)

@@ -36,6 +36,24 @@ vec3 sky(vec3 toward) {
 }
 """
 
+# The pattern averaged over the pixel's footprint: no moire at any distance (the box filters of I. Quilez).
+_CHECKER = """
+uniform vec3 checker0;
+uniform vec3 checker1;
+uniform vec3 checker2;  // of the lines along the edges of the image
+uniform float edge;     // half their width, in images
+vec3 checker(vec2 at) {
+    vec2 width = max(abs(dFdx(at)), abs(dFdy(at))) + 1e-4;
+    vec2 high = at + 0.5 * width, low = at - 0.5 * width;
+    vec2 wave = (abs(fract(high) - 0.5) - abs(fract(low) - 0.5)) / width;
+    vec2 line = floor(high + edge) + min(fract(high + edge) / (2.0 * edge), 1.0)
+              - floor(low + edge) - min(fract(low + edge) / (2.0 * edge), 1.0);
+    line = edge > 0.0 ? line * (2.0 * edge) / width : vec2(0.0);
+    vec3 squares = mix(checker0, checker1, 0.5 - 0.5 * wave.x * wave.y);
+    return mix(checker2, squares, (1.0 - line.x) * (1.0 - line.y));
+}
+"""
+
 SKY_VERTEX = """#version 330 core
 uniform mat4 rays;  // from clip space to directions in the world
 out vec3 ray;
@@ -72,7 +90,7 @@ def forward_vertex(shadows: int) -> str:
         _INSTANCE
         + f"""
 uniform mat4 view_projection;
-uniform vec4 uv_map;
+uniform vec2 uv_scale;
 uniform vec3 cube_scale;
 out vec3 p;
 out vec3 n;
@@ -83,7 +101,7 @@ void main() {{
     p = (X_WG * vec4(position, 1.0)).xyz;
     n = mat3(X_WG) * normal;
     gl_Position = view_projection * vec4(p, 1.0);
-    texture_uv = uv * uv_map.xy + uv_map.zw;
+    texture_uv = uv * uv_scale;
     cube_direction = position * cube_scale;
 {place}}}
 """
@@ -93,19 +111,23 @@ void main() {{
 def forward_fragment(lights: Sequence[tuple[str, int]], *, texture: str, ground: bool) -> str:
     """Fragment shader for these lights, each (kind, index of its shadow map or -1).
 
-    `texture`: "none", "2d" or "cube". `ground`: a plane, which fades into the sky with distance and, when it
-    has no texture, shows a faint checker.
+    `texture`: "none", "checker", "2d" or "cube". `ground`: a plane, which fades into the sky with distance.
     """
     shadows = sum(index >= 0 for _, index in lights)
     declare = "".join(f"uniform sampler2DShadow shadow_map{i};\nin vec4 in_map{i};\n" for i in range(shadows))
     count = max(1, len(lights))
-    sampler = {"none": "", "2d": "uniform sampler2D image;", "cube": "uniform samplerCube image;"}[texture]
+    sampler = {
+        "none": "",
+        "checker": "",
+        "2d": "uniform sampler2D image;",
+        "cube": "uniform samplerCube image;",
+    }[texture]
     read = {
         "none": "",
-        "2d": "    vec4 texel = texture(image, texture_uv); albedo *= texel.rgb * texel.rgb; alpha *= texel.a;",
+        "checker": "    albedo *= checker(texture_uv);",
+        "2d": "    vec4 texel = texture(image, texture_uv);\n    albedo *= texel.rgb * texel.rgb;\n    alpha *= texel.a;",
         "cube": "    vec3 texel = texture(image, cube_direction).rgb; albedo *= texel * texel;",
     }[texture]
-    checker = "    albedo *= checker(p.xy / cell);" if ground and texture == "none" else ""
     haze = "    shown = mix(shown, sky(-v), smoothstep(haze.x, haze.y, distance_to_eye));" if ground else ""
     body = "".join(_light(i, kind, shadow) for i, (kind, shadow) in enumerate(lights))
     return f"""#version 330 core
@@ -120,7 +142,6 @@ uniform vec3 surface;   // specular, exponent, emission
 uniform vec3 ambient_above;
 uniform vec3 ambient_below;
 uniform vec2 haze;
-uniform float cell;
 uniform vec3 light_position[{count}];
 uniform vec3 light_direction[{count}];
 uniform vec3 light_radiance[{count}];
@@ -139,12 +160,7 @@ float lit(sampler2DShadow map, vec4 at) {{
                  + texture(map, vec3(q.xy + vec2(step.x, 0.5 * step.y), q.z))
                  + texture(map, vec3(q.xy + vec2(-0.5 * step.x, step.y), q.z)));
 }}
-// Checker averaged over the pixel's footprint: no moire at any distance (the box filter of Quilez).
-float checker(vec2 at) {{
-    vec2 width = max(abs(dFdx(at)), abs(dFdy(at))) + 1e-4;
-    vec2 wave = 2.0 * (abs(fract((at - 0.5 * width) * 0.5) - 0.5) - abs(fract((at + 0.5 * width) * 0.5) - 0.5)) / width;
-    return 0.88 + 0.12 * wave.x * wave.y;
-}}
+{_CHECKER if texture == "checker" else ""}
 // x^e by Schlick's rational, which needs no pow.
 float shine(float x, float e) {{ return x / (e - e * x + x); }}
 void main() {{
@@ -156,12 +172,15 @@ void main() {{
     vec3 albedo = base.rgb;
     float alpha = base.a;
 {read}
-{checker}
     vec3 diffuse = mix(ambient_below, ambient_above, 0.5 + 0.5 * m.z);
     vec3 specular = vec3(0.0);
     float gloss = (surface.y + 8.0) * 0.015;
 {body}
-    vec3 light = albedo * (diffuse + surface.z) + surface.x * 0.18 * gloss * specular;
+    // What a smooth coat mirrors of the surroundings, more of it at grazing angles, lifts dark parts.
+    float graze = 1.0 - max(dot(m, v), 0.0);
+    float mirrored = 0.02 + 0.2 * graze * graze * graze;
+    vec3 around = mix(ambient_below, 3.0 * ambient_above, 0.5 + 0.5 * reflect(-v, m).z);
+    vec3 light = albedo * (diffuse + surface.z) + surface.x * (0.3 * gloss * specular + mirrored * around);
     light = light / (1.0 + max(light - 0.8, 0.0));  // a soft shoulder for what is brighter than white
     vec3 shown = sqrt(light);
 {haze}

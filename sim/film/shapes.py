@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
 
-_SEGMENTS = 48  # round the axis of a curved shape
-_RINGS = 24  # from pole to pole
+_SEGMENTS = 32  # round the axis of a curved shape: outlines true to 0.5 % of the radius
+_RINGS = 16  # from pole to pole
 _CREASE = np.deg2rad(35.0)  # faces that meet at a sharper angle are shaded apart
 
 
@@ -26,24 +26,23 @@ class Shape:
 def geom_shape(model: mujoco.MjModel, geom: int, *, plane_radius: float) -> Shape | None:
     """The surface of a geom in its own frame, or None for a type that has none.
 
-    A plane's infinite directions (size 0) end at `plane_radius` metres. Primitives carry the texture
-    coordinates that MuJoCo derives from x and y (`unit_uv`); meshes carry their own where they have them.
+    A plane's infinite directions (size 0) end at `plane_radius` metres. Primitives carry MuJoCo's texture
+    coordinates, once over each face or round the shape; meshes their own where they have them.
     """
     kind = mujoco.mjtGeom(model.geom_type[geom])
     size = model.geom_size[geom]
     data = int(model.geom_dataid[geom])
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_PLANE:
-        half = np.where(size[:2] > 0, size[:2], plane_radius)
-        return _plane(half)
+        return _plane(size[:2], plane_radius)
     if kind == types.mjGEOM_SPHERE:
         return _ellipsoid(np.full(3, size[0]))
     if kind == types.mjGEOM_ELLIPSOID:
         return _ellipsoid(size)
     if kind == types.mjGEOM_CAPSULE:
-        return _revolved(*_capsule_profile(size[0], size[1]))
+        return _capsule(size[0], size[1])
     if kind == types.mjGEOM_CYLINDER:
-        return _revolved(*_cylinder_profile(size[0], size[1]))
+        return _cylinder(size[0], size[1])
     if kind == types.mjGEOM_BOX:
         return _box(size)
     if kind == types.mjGEOM_HFIELD and data >= 0:
@@ -53,9 +52,12 @@ def geom_shape(model: mujoco.MjModel, geom: int, *, plane_radius: float) -> Shap
     return None
 
 
-def _plane(half: Floats) -> Shape:
-    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0.0]
-    return Shape(corners, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), corners[:, :2])
+def _plane(size: Floats, radius: float) -> Shape:
+    unit = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = unit * np.where(size > 0, size, radius)
+    uv = np.where(size > 0, (unit + 1) / 2, corners / 2) * [1, -1]  # without an end: one image in two metres
+    flat = np.column_stack([corners, np.zeros(4)])
+    return Shape(flat, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), uv)
 
 
 def _grid_indices(rows: int, columns: int) -> NDArray[np.integer]:
@@ -66,65 +68,63 @@ def _grid_indices(rows: int, columns: int) -> NDArray[np.integer]:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def _revolved(radius: Floats, height: Floats, normal_r: Floats, normal_z: Floats) -> Shape:
-    """A profile (from bottom to top) turned about z."""
-    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
-    cosine, sine = np.cos(angle), np.sin(angle)
+def _revolved(r: Floats, z: Floats, normal_r: Floats, normal_z: Floats, v: Floats) -> Shape:
+    """A profile, from bottom to top, turned about z; `v` (one a ring) is its texture coordinate."""
+    turn = np.linspace(0, 1, _SEGMENTS + 1)
+    cosine, sine = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
 
     def turned(r: Floats, z: Floats) -> Floats:
-        around = np.broadcast_to(z[:, None], (len(r), len(angle)))
+        around = np.broadcast_to(z[:, None], (len(r), len(turn)))
         return np.stack([np.outer(r, cosine), np.outer(r, sine), around], -1).reshape(-1, 3)
 
-    positions = turned(radius, height)
-    return Shape(
-        positions,
-        turned(normal_r, normal_z),
-        _grid_indices(len(radius), len(angle)),
-        positions[:, :2],
-    )
+    uv = np.stack([np.tile(turn, len(r)), np.repeat(v, len(turn))], axis=1)
+    return Shape(turned(r, z), turned(normal_r, normal_z), _grid_indices(len(r), len(turn)), uv)
 
 
 def _ellipsoid(size: Floats) -> Shape:
     latitude = np.linspace(-np.pi / 2, np.pi / 2, _RINGS + 1)
     r, z = np.cos(latitude), np.sin(latitude)
-    unit = _revolved(r, z, r, z)
+    unit = _revolved(r, z, r, z, 0.5 - latitude / np.pi)
     normals = unit.positions / size
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    positions = unit.positions * size
-    return Shape(positions, normals, unit.indices, positions[:, :2])
+    return Shape(unit.positions * size, normals, unit.indices, unit.uv)
 
 
-def _capsule_profile(radius: float, half: float) -> tuple[Floats, ...]:
+def _capsule(radius: float, half: float) -> Shape:
     latitude = np.linspace(0, np.pi / 2, _RINGS // 2 + 1)
-    r = np.concatenate([np.cos(latitude[::-1]), np.cos(latitude)])
-    z = np.concatenate([-np.sin(latitude[::-1]), np.sin(latitude)])
-    shift = np.repeat([-half, half], len(latitude))
-    return radius * r, radius * z + shift, r, z
+    below, above = -latitude[::-1], latitude
+    # Each hemisphere and the barrel between them carry the whole image, so the rims come twice.
+    angle = np.concatenate([below, [0.0, 0.0], above])
+    r, z = np.cos(angle), np.sin(angle)
+    shift = np.concatenate([np.full(len(below) + 1, -half), np.full(len(above) + 1, half)])
+    v = np.concatenate([-2 * below / np.pi, [1.0, 0.0], 1 - 2 * above / np.pi])
+    return _revolved(radius * r, radius * z + shift, r, z, v)
 
 
-def _cylinder_profile(radius: float, half: float) -> tuple[Floats, ...]:
+def _cylinder(radius: float, half: float) -> Shape:
     r = np.array([0.0, radius, radius, radius, radius, 0.0])
     z = half * np.array([-1.0, -1, -1, 1, 1, 1])
-    return r, z, np.array([0.0, 0, 1, 1, 0, 0]), np.array([-1.0, -1, 0, 0, 1, 1])
+    normal_r, normal_z = np.array([0.0, 0, 1, 1, 0, 0]), np.array([-1.0, -1, 0, 0, 1, 1])
+    whole = _revolved(r, z, normal_r, normal_z, (1 - z / half) / 2)
+    lids = np.abs(whole.normals[:, 2:]) > 0.5
+    uv = np.where(lids, 0.5 + whole.positions[:, :2] / (2 * radius), whole.uv)
+    return Shape(whole.positions, whole.normals, whole.indices, uv)
 
 
 def _box(size: Floats) -> Shape:
-    positions, normals = [], []
-    for axis in range(3):
+    positions, normals, uv = [], [], []
+    for axis, (across, up) in enumerate(((1, 2), (0, 2), (0, 1))):
         for sign in (-1.0, 1.0):
-            n, u = np.zeros(3), np.zeros(3)
-            n[axis], u[(axis + 1) % 3] = sign, 1.0
-            v = np.cross(n, u)
-            positions += [n - u - v, n + u - v, n + u + v, n - u + v]
+            n, a = np.zeros(3), np.zeros(3)
+            n[axis], a[(axis + 1) % 3] = sign, 1.0
+            b = np.cross(n, a)
+            face = [n - a - b, n + a - b, n + a + b, n - a + b]
+            positions += face
             normals += [n] * 4
+            uv += [((corner[across] + 1) / 2, (1 - corner[up]) / 2) for corner in face]
     first = 4 * np.arange(6)[:, None]
-    corners = np.array(positions) * size
-    return Shape(
-        corners,
-        np.array(normals),
-        np.concatenate([first + [0, 1, 2], first + [0, 2, 3]]),
-        corners[:, :2],
-    )
+    indices = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+    return Shape(np.array(positions) * size, np.array(normals), indices, np.array(uv))
 
 
 def _height_field(model: mujoco.MjModel, field: int) -> Shape:
@@ -151,7 +151,7 @@ def _height_field(model: mujoco.MjModel, field: int) -> Shape:
         positions,
         np.concatenate([p.normals for p in parts]),
         np.concatenate([p.indices + o for p, o in zip(parts, offsets, strict=True)]),
-        positions[:, :2],
+        (positions[:, :2] / [x_half, y_half] * [1, -1] + 1) / 2,
     )
 
 
@@ -176,7 +176,7 @@ def _mesh(model: mujoco.MjModel, mesh: int) -> Shape:
 
 
 def crease_normals(vertices: Floats, faces: NDArray[np.integer], crease: float) -> Floats:
-    """A unit normal for each corner of each face (m, 3, 3): smooth, except across edges sharper than `crease`.
+    """A unit normal for each corner of each face (m, 3, 3): smooth but across edges sharper than `crease`.
 
     Every corner averages, weighted by area, the faces round its vertex whose normals differ from its own
     face's by less than `crease` (rad). Vertices at one place count as one, as STL files repeat them.
@@ -204,3 +204,31 @@ def crease_normals(vertices: Floats, faces: NDArray[np.integer], crease: float) 
     normals = np.empty_like(total)
     normals[order] = total
     return normals.reshape(-1, 3, 3)
+
+
+def coarse(shape: Shape, cell: float) -> Shape:
+    """The surface with vertices that share a cell of a grid of width `cell` (m) merged into their mean.
+
+    Vertices whose normals differ much keep apart in shading, not in place, so edges stay sharp. Triangles
+    that shrink to a line vanish. (Vertex clustering: Rossignac and Borrel, 1993.)
+    """
+    _, place = np.unique(np.floor(shape.positions / cell).astype(np.int64), axis=0, return_inverse=True)
+    place = place.ravel()
+    facing = np.round(1.5 * shape.normals).astype(np.int64) @ [9, 3, 1]
+    _, first, merged = np.unique(
+        np.stack([place, facing], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    merged = merged.ravel()
+
+    def mean(values: Floats, label: NDArray[np.integer]) -> Floats:
+        sums = [np.bincount(label, weights=values[:, axis]) for axis in range(values.shape[1])]
+        return np.stack(sums, axis=1) / np.bincount(label)[:, None]
+
+    positions = mean(shape.positions, place)[place[first]]
+    normals = mean(shape.normals, merged)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), shape.normals[first])
+    corners = place[shape.indices]
+    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    uv = None if shape.uv is None else mean(shape.uv, merged)
+    return Shape(positions, normals, merged[shape.indices[whole]], uv)
