@@ -10,6 +10,7 @@ import numpy as np
 from .control import Replay
 from .engines.contact import ORDER
 from .engines.interface import Array, Engine, Event, Problem, Segment
+from .kinds import BALL, FREE, HINGE
 from .recording import ErrorEstimate
 
 
@@ -51,12 +52,12 @@ def difference(model: mujoco.MjModel, q1: Array, q2: Array) -> tuple[Array, Arra
         mujoco.mj_differentiatePos(model, dq[i], 1.0, q1[i], q2[i])
     for j in range(model.njnt):
         dof, kind = model.jnt_dofadr[j], model.jnt_type[j]
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
+        if kind == FREE:
             length = np.maximum(length, np.linalg.norm(dq[:, dof : dof + 3], axis=1))
             angle = np.maximum(angle, np.linalg.norm(dq[:, dof + 3 : dof + 6], axis=1))
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+        elif kind == BALL:
             angle = np.maximum(angle, np.linalg.norm(dq[:, dof : dof + 3], axis=1))
-        elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+        elif kind == HINGE:
             angle = np.maximum(angle, np.abs(dq[:, dof]))
         else:
             length = np.maximum(length, np.abs(dq[:, dof]))

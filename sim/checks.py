@@ -8,6 +8,7 @@ import numpy as np
 from ..models import name_of
 from .engines.interface import Array, Role
 from .engines.prescribe import prescribed_bodies
+from .kinds import HINGE, SCALAR
 from .scene.build import Setup
 
 _FRAMES = 400  # at most this many frames are searched for overlaps
@@ -24,7 +25,7 @@ def check_frames(setup: Setup, t: Array, q: Array) -> list[str]:
 def _limits(setup: Setup, t: Array, q: Array) -> list[str]:
     m, out = setup.as_filed, []
     for j in range(m.njnt):
-        scalar = m.jnt_type[j] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        scalar = int(m.jnt_type[j]) in SCALAR
         enforced = setup.scene.physics.limits and setup.roles[j] != Role.KEYED
         if not (scalar and m.jnt_limited[j]) or enforced:
             continue
@@ -33,7 +34,7 @@ def _limits(setup: Setup, t: Array, q: Array) -> list[str]:
         beyond = np.maximum(low - x, x - high)
         worst = int(np.argmax(beyond))
         if beyond[worst] > 1e-9:
-            unit = "rad" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else "m"
+            unit = "rad" if m.jnt_type[j] == HINGE else "m"
             out.append(
                 f"joint {name_of(m, 'joint', j)!r} leaves its range [{low:.4g}, {high:.4g}] {unit} by "
                 f"{beyond[worst]:.3g} {unit} at t = {t[worst]:.3g} s (limit not simulated)"

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from .clip import Clip
 from .engines.interface import Array, Drive, Held, Problem, Role
+from .kinds import SCALAR
 
-_FIRST_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_AFFINE_GAIN = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+_AFFINE_BIAS = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
 
 class Target(NamedTuple):
@@ -122,18 +125,15 @@ def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> tup
 
 def why_not_controllable(model: mujoco.MjModel, i: int) -> str:
     """Why a controller cannot drive actuator ``i``; empty when it can."""
-    if model.actuator_trntype[i] not in _FIRST_JOINT_TRANSMISSIONS:
+    if int(model.actuator_trntype[i]) not in _ON_JOINT:
         return "it does not act on one joint"
     joint = int(model.actuator_trnid[i, 0])
-    if model.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    if int(model.jnt_type[joint]) not in SCALAR:
         return "it acts on a ball or free joint"
     if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
         return "it has activation dynamics"
-    affine = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
-    if model.actuator_gaintype[i] not in affine or model.actuator_biastype[i] not in (
-        mujoco.mjtBias.mjBIAS_NONE,
-        mujoco.mjtBias.mjBIAS_AFFINE,
-    ):
+    gain, bias = int(model.actuator_gaintype[i]), int(model.actuator_biastype[i])
+    if gain not in _AFFINE_GAIN or bias not in _AFFINE_BIAS:
         return "its force is no affine function of its control"
     return ""
 

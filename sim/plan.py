@@ -87,7 +87,7 @@ def plan_setup(setup: Setup) -> Plan:
         problem,
         period,
         tuple(_left_out(setup, engine.what)),
-        tuple(_cheaper(setup, engine.what, touch)),
+        tuple(_cheaper(setup, engine.what, integrator.what, touch)),
     )
 
 
@@ -141,7 +141,7 @@ def _step(setup: Setup, engine: str, period: float | None) -> tuple[float, Choic
                     setup,
                     ("controller", "period"),
                     f"the controller's period {period:g} s is no whole multiple of the step {asked:g} s; "
-                    f"steps that are: {period / max(1, np.floor(ratio)):.6g}, {period / np.ceil(ratio):.6g} s",
+                    f"try {period / max(1, np.floor(ratio)):.6g} s or {period / np.ceil(ratio):.6g} s",
                 )
         return asked, Choice(f"{asked:g} s", "the scene asks for it")
     h = float(model.opt.timestep)
@@ -170,7 +170,7 @@ def _integrator(setup: Setup, engine: str, touch: bool, h: float) -> Choice:
     if fastest * h > 1.0:
         return Choice("discrete", f"servos or springs at {fastest:.3g} rad/s are stiff for a step of {h:g} s")
     if touch:
-        return Choice("discrete", "bodies can touch, and contact leaves RK4 no better than order 1")
+        return Choice("rk4", "nothing is stiff; order 4 between contacts, 1 where they begin and end")
     return Choice("rk4", "the motion is smooth: order 4")
 
 
@@ -249,13 +249,15 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
     return out
 
 
-def _cheaper(setup: Setup, engine: str, touch: bool) -> list[str]:
+def _cheaper(setup: Setup, engine: str, integrator: str, touch: bool) -> list[str]:
     out = []
     if engine == "contact" and touch:
         out.append(
             'if contacts do not matter, physics.contacts = "none" saves their detection and solution, '
             "and lets RK4 reach order 4"
         )
+    if engine == "contact" and touch and integrator == "rk4":
+        out.append("integrator = \"discrete\" needs one evaluation a step instead of four, at order 1")
     if engine == "contact" and setup.scene.solver.step != "auto":
         h, own = float(setup.scene.solver.step), float(setup.model.opt.timestep)
         if h < own:

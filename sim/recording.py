@@ -164,8 +164,8 @@ def load(path: str | Path) -> Recording:
         raise RecordingError(f"{path} lacks a part of a recording: {e}") from None
 
 
-def _pack(recording: Recording) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays: dict[str, np.ndarray] = {}
+def _pack(recording: Recording) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
     header: dict[str, Any] = {}
     for f in fields(Recording):
         value = getattr(recording, f.name)
@@ -182,7 +182,7 @@ def _pack(recording: Recording) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, header
 
 
-def _unpack(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Recording:
+def _unpack(arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> Recording:
     header = {k: v for k, v in header.items() if k not in ("magic", "version")}
     model_bytes = arrays.pop("model_bytes").tobytes()
     error = header.pop("error", None)
@@ -190,7 +190,8 @@ def _unpack(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Recording:
         error = ErrorEstimate(angle=arrays.pop("error_angle"), length=arrays.pop("error_length"), **error)
     header["events"] = tuple(Event(*e) for e in header["events"])
     header["notes"] = tuple(header["notes"])
-    return Recording(**arrays, **header, model_bytes=model_bytes, error=error)
+    parts: dict[str, Any] = {**arrays, **header}
+    return Recording(**parts, model_bytes=model_bytes, error=error)
 
 
 def model_to_bytes(model: mujoco.MjModel) -> bytes:

@@ -9,7 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ...models import captured_warnings
 from ..errors import EngineError
+from ..kinds import BALL, FREE
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
@@ -47,7 +49,9 @@ class ContactEngine:
                 f"the contact engine has no integrator {problem.integrator!r}; "
                 f"it has: {', '.join(sorted(INTEGRATORS))}"
             )
-        return _Run(problem, t_span, controls).segment(progress)
+        # a run that blows up is reported by its segment; MuJoCo would write to stderr and a log file
+        with captured_warnings():
+            return _Run(problem, t_span, controls).segment(progress)
 
 
 class _Run:
@@ -80,10 +84,10 @@ class _Run:
         self._start()
         try:
             while True:
-                self._stop_at(k)
                 if message := self._nonsense(k):
                     status = "diverged"
                     break
+                self._stop_at(k)
                 if k >= self.steps:
                     break
                 n = self._until_next(k)
@@ -285,12 +289,12 @@ def _quaternion_joints(model: mujoco.MjModel) -> tuple[Array, Array, list[int], 
     quat_q: list[int] = []
     quat_v: list[int] = []
     for joint in range(model.njnt):
-        iq, iv, kind = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_type[joint]
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
+        iq, iv, kind = model.jnt_qposadr[joint], model.jnt_dofadr[joint], int(model.jnt_type[joint])
+        if kind == FREE:
             scalar_q += [iq, iq + 1, iq + 2]
             scalar_v += [iv, iv + 1, iv + 2]
             iq, iv = iq + 3, iv + 3
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+        if kind in (FREE, BALL):
             quat_q.append(int(iq))
             quat_v.append(int(iv))
         else:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from ...models import name_of
+from ...models import captured_warnings, name_of
 from .interface import Array, Event, Problem, Role, Segment
 from .prescribe import Prescriber
 from .timed import Timed
@@ -33,6 +33,11 @@ class Derived:
 
 def derive(problem: Problem, segment: Segment) -> Derived:
     """Evaluate the model at every sample of ``segment``."""
+    with captured_warnings():
+        return _derive(problem, segment)
+
+
+def _derive(problem: Problem, segment: Segment) -> Derived:
     m, n = problem.model, len(segment.t)
     p = Prescriber(m, problem.dofs(Role.KEYED))
     p.model.opt.timestep = problem.step

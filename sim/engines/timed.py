@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .interface import Array, Drive, Problem, Role
 
@@ -40,8 +41,9 @@ class Timed:
         """Whether nothing depends on time, so that steps need no Python between them."""
         return not (len(self.keyed) or len(self.servos) or len(self.bodies))
 
-    def at(self, t: Array, *, left: bool = False) -> TimedInputs:
+    def at(self, t: NDArray[np.floating], *, left: bool = False) -> TimedInputs:
         """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
+        t = np.asarray(t, dtype=np.float64)
         n, k = len(t), len(self.keyed)
         q, v, a = np.zeros((n, len(self.qpos))), np.zeros((n, k)), np.zeros((n, k))
         if k:
@@ -60,7 +62,7 @@ class Timed:
         return TimedInputs(q, v, a, ctrl, wrench)
 
 
-def keyed_qpos(problem: Problem) -> np.ndarray:
+def keyed_qpos(problem: Problem) -> NDArray[np.bool_]:
     """Mask (nq,) of the coordinates of keyed joints."""
     m = problem.model
     mask = np.zeros(m.nq, dtype=bool)
@@ -71,6 +73,6 @@ def keyed_qpos(problem: Problem) -> np.ndarray:
     return mask
 
 
-def driven_by_keys(problem: Problem) -> np.ndarray:
+def driven_by_keys(problem: Problem) -> NDArray[np.bool_]:
     """Actuators (nu,) mask whose ctrl comes from keys."""
     return np.asarray(problem.drives == Drive.KEYS, dtype=bool)

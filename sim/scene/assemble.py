@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from ...models import load_spec
+from ...models import chain, load_spec
 from ..errors import ModelError
 from .mistakes import Mistake
 from .schema import ModelItem, Placement, PropItem, Scene
@@ -27,35 +28,51 @@ def assemble(scene: Scene) -> tuple[mujoco.MjSpec | None, list[Mistake]]:
     specs: list[tuple[ModelItem, mujoco.MjSpec]] = []
     for i, item in enumerate(scene.models):
         try:
-            specs.append((item, load_spec(item.file, base=scene.base)))
+            specs.append((item, _load(item, scene)))
         except ModelError as e:
-            mistakes.append(Mistake(("models", i, "file"), str(e)))
+            mistakes.append(Mistake(("models", i, "chain" if item.chain else "file"), str(e)))
     if mistakes:
         return None, mistakes
     spec = _host(specs, scene)
-    for i, prop in enumerate(scene.props):
-        try:
-            _add_prop(spec, prop, scene)
-        except ModelError as e:
-            mistakes.append(Mistake(("props", i), str(e)))
+    mistakes += _add_props(spec, scene)
     return (None if mistakes else spec), mistakes
 
 
+def _load(item: ModelItem, scene: Scene) -> mujoco.MjSpec:
+    if item.chain is not None:
+        options = item.chain.model_dump()
+        return chain(options.pop("links"), **options)
+    return load_spec(str(item.file), base=scene.base)
+
+
 def _host(specs: list[tuple[ModelItem, mujoco.MjSpec]], scene: Scene) -> mujoco.MjSpec:
-    """A lone unnamed model at the origin stays as it is; others are attached to a fresh world.
+    """A lone unnamed model is the world itself; named ones are attached to a fresh world.
 
     Options (time step, gravity, solver) come from the first model.
     """
-    if len(specs) == 1 and specs[0][0].name is None and _is_origin(specs[0][0]):
-        return specs[0][1]
+    if len(specs) == 1 and specs[0][0].name is None:
+        item, host = specs[0]
+        if not _is_origin(item):
+            _move(host, item, scene)
+        return host
     host = mujoco.MjSpec()
     host.modelname = scene.title or "scene"
     for i, (item, child) in enumerate(specs):
         if i == 0:
             _copy_options(child, host)
         frame = host.worldbody.add_frame(pos=item.position, quat=_quat(item, scene))
-        host.attach(child, prefix=f"{item.name}/" if item.name else "", frame=frame)
+        host.attach(child, prefix=f"{item.name}/", frame=frame)
     return host
+
+
+def _move(spec: mujoco.MjSpec, item: ModelItem, scene: Scene) -> None:
+    """Put everything that stands in the world of ``spec`` into one placed frame."""
+    world = spec.worldbody
+    things = [x for kind in ("bodies", "geoms", "sites", "cameras", "lights") for x in getattr(world, kind)]
+    outer = [f for f in world.frames if f.frame is None]
+    frame = world.add_frame(pos=item.position, quat=_quat(item, scene))
+    for thing in [*outer, *(x for x in things if x.frame is None)]:
+        thing.set_frame(frame)
 
 
 def _copy_options(child: mujoco.MjSpec, host: mujoco.MjSpec) -> None:
@@ -68,6 +85,28 @@ def _copy_options(child: mujoco.MjSpec, host: mujoco.MjSpec) -> None:
                 getattr(target, name)[:] = value
             elif isinstance(value, int | float):
                 setattr(target, name, value)
+
+
+_PROP = "prop:"
+
+
+def _add_props(spec: mujoco.MjSpec, scene: Scene) -> list[Mistake]:
+    """Props come from a spec of their own, so that no model's defaults reach them."""
+    loose, mistakes = mujoco.MjSpec(), []
+    taken = {b.name for b in spec.bodies} | {j.name for j in spec.joints} | {g.name for g in spec.geoms}
+    for i, prop in enumerate(scene.props):
+        if prop.name in taken:
+            mistakes.append(Mistake(("props", i, "name"), f"the models have a {prop.name!r} already"))
+        elif prop.file is not None and not (scene.base / prop.file).is_file():
+            mistakes.append(Mistake(("props", i, "file"), f"no mesh file {scene.base / prop.file}"))
+        else:
+            _add_prop(loose, prop, scene)
+    if mistakes or not scene.props:
+        return mistakes
+    spec.attach(loose, prefix=_PROP, frame=spec.worldbody.add_frame())
+    for thing in [*spec.bodies, *spec.joints, *spec.geoms]:
+        thing.name = thing.name.removeprefix(_PROP)
+    return []
 
 
 def _add_prop(spec: mujoco.MjSpec, prop: PropItem, scene: Scene) -> None:
@@ -84,11 +123,8 @@ def _add_prop(spec: mujoco.MjSpec, prop: PropItem, scene: Scene) -> None:
         geom.mass = prop.mass
     if prop.friction is not None:
         geom.friction[0] = prop.friction
-    if prop.shape == "mesh":
-        path = scene.base / str(prop.file)
-        if not path.is_file():
-            raise ModelError(f"no mesh file {path}")
-        spec.add_mesh(name=prop.name, file=str(path.resolve()))
+    if prop.file is not None:
+        spec.add_mesh(name=prop.name, file=str((scene.base / prop.file).resolve()))
         geom.meshname = prop.name
     elif prop.shape == "plane":
         _checker(spec, geom, rgba, prop)
@@ -151,10 +187,10 @@ def apply_contacts(spec: mujoco.MjSpec, model: mujoco.MjModel, scene: Scene) -> 
                 )
             sides.append(geoms)
         pairs |= {(min(a, b), max(a, b)) for a in sides[0] for b in sides[1] if a != b}
-    geoms = list(spec.geoms)
+    shapes = list(spec.geoms)
     for k, (a, b) in enumerate(sorted(pairs)):
-        spec.add_pair(name=f"scene_pair{k}", geomname1=geoms[a].name, geomname2=geoms[b].name)
-    for geom in geoms:
+        spec.add_pair(name=f"scene_pair{k}", geomname1=shapes[a].name, geomname2=shapes[b].name)
+    for geom in shapes:
         geom.contype = 0
         geom.conaffinity = 0
     return mistakes
@@ -182,7 +218,7 @@ def _geoms_of(model: mujoco.MjModel, name: str) -> list[int]:
     return [g for g in found if model.geom_contype[g] or model.geom_conaffinity[g]]
 
 
-def exclude_prescribed(spec: mujoco.MjSpec, model: mujoco.MjModel, prescribed: np.ndarray) -> None:
+def exclude_prescribed(spec: mujoco.MjSpec, model: mujoco.MjModel, prescribed: NDArray[np.bool_]) -> None:
     """No contacts between bodies that both move as keyed (mask (nbody,)): neither could yield."""
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     bodies = [b for b in range(model.nbody) if prescribed[b] and touching[model.geom_bodyid == b].any()]

@@ -15,6 +15,7 @@ from ..control import is_position_servo, why_not_controllable
 from ..engines.interface import Array, Drive, Role, State, Wrench
 from ..engines.prescribe import prescribed_bodies
 from ..errors import PantographError, SceneError
+from ..kinds import BALL, FREE, HINGE, SCALAR
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
 from .mistakes import Mistake, report
 from .motion import Curves, constant_or_keyed, curves
@@ -131,9 +132,9 @@ def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[
                 elif j in exact:
                     continue
                 roles[j] = role
-    for j in np.flatnonzero(roles == Role.KEYED):
-        if int(j) not in found.tracks:
-            name = name_of(model, "joint", int(j))
+    for keyed in np.flatnonzero(roles == Role.KEYED):
+        if int(keyed) not in found.tracks:
+            name = name_of(model, "joint", int(keyed))
             message = f"joint {name!r} is keyed but has no keys; add [[keys]] joint = {name!r}"
             mistakes.append(Mistake(("roles", "keyed"), message))
     return roles, mistakes
@@ -165,7 +166,7 @@ def _initial(scene: Scene, model: mujoco.MjModel) -> tuple[State, list[Mistake]]
             if len(row) != width:
                 mistakes.append(Mistake(path, f"needs {width} number{'s' * (width > 1)}, got {len(row)}"))
                 continue
-            if scene.angle == "degree" and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            if scene.angle == "degree" and model.jnt_type[joint] == HINGE:
                 row = np.deg2rad(row)
             array[start[joint] : start[joint] + width] = row
     mujoco.mj_normalizeQuat(model, data.qpos)
@@ -173,12 +174,8 @@ def _initial(scene: Scene, model: mujoco.MjModel) -> tuple[State, list[Mistake]]
 
 
 def _width(model: mujoco.MjModel, joint: int, word: str) -> int:
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-    if kind == mujoco.mjtJoint.mjJNT_FREE:
-        return 7 if word == "position" else 6
-    if kind == mujoco.mjtJoint.mjJNT_BALL:
-        return 4 if word == "position" else 3
-    return 1
+    position, velocity = {FREE: (7, 6), BALL: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
+    return position if word == "position" else velocity
 
 
 def _start_on_keys(scene: Scene, model: mujoco.MjModel, clip: Clip, state0: State) -> State:
@@ -268,9 +265,9 @@ def _suggested(scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], fou
 
 
 def _on_joint(model: mujoco.MjModel, i: int) -> bool:
-    return bool(model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT) and model.jnt_type[
-        model.actuator_trnid[i, 0]
-    ] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    joint = int(model.actuator_trnid[i, 0])
+    on = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+    return bool(on) and int(model.jnt_type[joint]) in SCALAR
 
 
 def _servo_along_keys(model: mujoco.MjModel, clip: Clip, i: int) -> Callable[[Array], Array]:

@@ -11,6 +11,7 @@ import numpy as np
 from ..clip import FreeTrack, Track
 from ..curves import Curve, keyed
 from ..errors import PantographError
+from ..kinds import BALL, FREE, HINGE
 from ..rotation_curves import keyed_rotation
 from ..rotations import from_euler
 from .mistakes import Mistake, Path_
@@ -19,6 +20,8 @@ from .schema import KeysItem, Scene
 
 _WIDTH = {"position": 3, "target": 3, "fovy": 1, "intensity": 1, "color": 3}
 
+FilmCurves = dict[tuple[str, str], Curve]
+
 
 @dataclass
 class Curves:
@@ -26,8 +29,8 @@ class Curves:
 
     tracks: dict[int, Track] = field(default_factory=dict)
     actuators: dict[int, Curve] = field(default_factory=dict)
-    cameras: dict[tuple[str, str], Curve] = field(default_factory=dict)
-    lights: dict[tuple[str, str], Curve] = field(default_factory=dict)
+    cameras: FilmCurves = field(default_factory=dict)
+    lights: FilmCurves = field(default_factory=dict)
 
 
 def curves(scene: Scene, model: mujoco.MjModel) -> tuple[Curves, list[Mistake]]:
@@ -50,7 +53,7 @@ def curves(scene: Scene, model: mujoco.MjModel) -> tuple[Curves, list[Mistake]]:
         except PantographError as e:
             mistakes.append(Mistake(("keys", i), str(e)))
     for joint, channels in parts.items():
-        free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        free = model.jnt_type[joint] == FREE
         out.tracks[joint] = FreeTrack(**channels) if free else next(iter(channels.values()))
     return out, mistakes
 
@@ -79,16 +82,13 @@ def _joint(
     if name not in joints.ids:
         raise _At("joint", joints.missing(name))
     joint = joints.ids[name]
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-    channels = {
-        mujoco.mjtJoint.mjJNT_FREE: ("position", "rotation"),
-        mujoco.mjtJoint.mjJNT_BALL: ("rotation",),
-    }.get(kind, ("value",))
+    kind = int(model.jnt_type[joint])
+    channels = {FREE: ("position", "rotation"), BALL: ("rotation",)}.get(kind, ("value",))
     channel = item.channel or (channels[0] if len(channels) == 1 else None)
     if channel is None:
         raise _At("joint", f'joint {name!r} is free: its keys need channel = "position" or "rotation"')
     if channel not in channels:
-        what = kind.name.removeprefix("mjJNT_").lower()
+        what = {FREE: "free", BALL: "ball", HINGE: "hinge"}.get(kind, "slide")
         raise _At(
             "channel", f"{what} joint {name!r} has no channel {channel!r}; it has: {', '.join(channels)}"
         )
@@ -96,7 +96,7 @@ def _joint(
         curve: Curve = _rotations(item, scene)
     else:
         curve = _scalars(item, 3 if channel == "position" else 1)
-        if kind == mujoco.mjtJoint.mjJNT_HINGE and scene.angle == "degree":
+        if kind == HINGE and scene.angle == "degree":
             curve = _scalars(item, 1, scale=np.pi / 180)
     _once(parts.setdefault(joint, {}), channel, curve)
 
@@ -137,6 +137,15 @@ def _film(item: KeysItem, scene: Scene, out: Curves) -> None:
     target = out.cameras if word == "camera" else out.lights
     channel = str(item.channel)
     _once(target, (name, channel), _scalars(item, _WIDTH[channel]))
+
+
+def film_curves(scene: Scene) -> tuple[FilmCurves, FilmCurves]:
+    """Curves of the keys of cameras and of lights, by (name, channel)."""
+    out = Curves()
+    for item in scene.keys:
+        if item.camera is not None or item.light is not None:
+            _film(item, scene, out)
+    return out.cameras, out.lights
 
 
 def constant_or_keyed(

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from typing import Literal
 
 import mujoco
 
-from ...models import name_of
+from ...models import names_of
 from ..errors import unknown
 
-COUNT = {
-    "joint": "njnt",
-    "body": "nbody",
-    "actuator": "nu",
-    "geom": "ngeom",
-    "site": "nsite",
-    "camera": "ncam",
-    "light": "nlight",
-}
+Kind = Literal["joint", "body", "actuator", "camera"]
 
 
 class Names:
     """Ids by name, for one kind of thing in a model."""
 
-    def __init__(self, model: mujoco.MjModel, kind: str) -> None:
+    def __init__(self, model: mujoco.MjModel, kind: Kind) -> None:
         self.kind = kind
-        self.ids = {name_of(model, kind, i): i for i in range(int(getattr(model, COUNT[kind])))}
+        self.ids = {name: i for i, name in enumerate(names_of(model, kind))}
 
     def match(self, pattern: str) -> list[int]:
         """Ids that a name or pattern with * means; none when nothing matches."""

@@ -7,8 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 
-FORMAT = 1
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -40,11 +38,34 @@ class Placement(Item):
         return self
 
 
-class ModelItem(Placement):
-    """A robot or figure from a file."""
+class ChainItem(Item):
+    """A chain of equal links hanging from its upper end, or loose; see ``pantograph.models.chain``."""
 
-    file: str = Field(description="built-in model name, or a path to MJCF or URDF, relative to the scene")
+    links: Annotated[int, Field(ge=1, le=1000)]
+    length: Positive = Field(1.0, description="of the whole chain, metres")
+    mass: Positive = Field(1.0, description="of the whole chain, kg")
+    joint: Literal["ball", "hinge"] = "ball"
+    radius: Positive | None = Field(None, description="of the links, metres")
+    damping: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="N m s/rad")
+    fixed: bool = Field(True, description="hangs from the world; otherwise it is loose")
+    point_masses: bool = False
+    contacts: bool = Field(False, description="links touch other things")
+
+
+class ModelItem(Placement):
+    """A robot or figure from a file, or a chain."""
+
+    file: str | None = Field(
+        None, description="built-in model name, or a path to MJCF or URDF, relative to the scene"
+    )
+    chain: ChainItem | None = None
     name: str | None = Field(None, pattern=r"^[\w.-]+$", description="prefix 'name/' of everything in it")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ModelItem:
+        if (self.file is None) == (self.chain is None):
+            raise ValueError("give 'file' or 'chain', one of them")
+        return self
 
 
 class PropItem(Placement):
@@ -248,7 +269,7 @@ class FilmItem(Item):
 class Scene(Item):
     """A whole scene. ``Scene(**toml)`` and ``load_scene(path)`` give equal objects."""
 
-    format: Literal[1] = Field(FORMAT, description="version of this format")
+    format: Literal[1] = Field(1, description="version of this format")
     title: str = ""
     duration: Positive = Field(description="seconds")
     angle: Literal["radian", "degree"] = Field("radian", description="unit of all angles in this scene")

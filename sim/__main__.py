@@ -1,0 +1,5 @@
+"""``python -m pantograph.sim`` is the command ``pantograph``."""
+
+from .cli import main
+
+main()

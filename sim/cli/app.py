@@ -1,0 +1,175 @@
+"""Commands and their exit codes: 0 done, 1 the run failed, 2 wrong input, 130 interrupted."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from ..errors import PantographError
+from . import show
+from .template import TEMPLATE
+
+app = typer.Typer(
+    name="pantograph",
+    help="Key, simulate, film and mirror articulated structures.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+console = Console()
+errors = Console(stderr=True)
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML); see 'pantograph new'.")]
+RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'pantograph run'.")]
+
+
+def run_app() -> None:
+    """Run the command line; mistakes are told in words, without a traceback."""
+    try:
+        app()
+    except PantographError as e:
+        errors.print(f"[bold red]error:[/] {escape(str(e))}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        sys.exit(130)
+
+
+@app.command(epilog="Example: pantograph run wave.toml --film wave.mp4 --plot wave.png --error")
+def run(
+    scene: SceneFile,
+    film: Annotated[Path | None, typer.Option(help="Film to write: .mp4, .gif, or a folder of PNG.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot to write: .png, .svg or .pdf.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the recording, and for bare file names.")] = Path(
+        "out"
+    ),
+    error: Annotated[
+        bool, typer.Option("--error", help="Estimate the error by a run at half the step.")
+    ] = False,
+) -> None:
+    """Run a scene; its recording is always saved."""
+    from ..plan import make_plan
+    from ..run import run as run_scene
+    from ..scene.load import load_scene
+
+    plan = make_plan(load_scene(scene))
+    with show.progress(f"simulating {scene.stem}", plan.problem.duration) as advance:
+        recording = run_scene(plan, error=error, progress=advance)
+    saved = recording.save(out / f"{scene.stem}.npz")
+    console.print(show.summary(recording))
+    show.notes(console, recording)
+    console.print(f"recording: {saved}")
+    _draw(recording, film, plot, out)
+    _finish(recording)
+
+
+@app.command(epilog="Example: pantograph plan wave.toml")
+def plan(scene: SceneFile) -> None:
+    """Explain how a scene will be computed, what is left out, and what would be cheaper."""
+    from ..plan import make_plan
+    from ..scene.load import load_scene
+
+    show.plan(console, make_plan(load_scene(scene)))
+
+
+@app.command(epilog="Example: pantograph film out/wave.npz wave.gif --camera side")
+def film(
+    recording: RecordingFile,
+    path: Annotated[Path, typer.Argument(help="Film: .mp4, .gif, a folder, or a picture with --at.")],
+    camera: Annotated[str | None, typer.Option(help="Camera of the scene or the model file.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second.", min=0.1)] = None,
+    size: Annotated[str | None, typer.Option(help="Picture size, as 640x480.")] = None,
+    shadows: Annotated[bool | None, typer.Option(help="Draw shadows; default as the scene says.")] = None,
+    at: Annotated[float | None, typer.Option(help="One picture at this time [s] instead of a film.")] = None,
+) -> None:
+    """Film a recording without simulating again."""
+    from ..recording import load
+    from ..shoot import shoot
+
+    written = shoot(load(recording), path, camera=camera, fps=fps, size=_size(size), shadows=shadows, at=at)
+    console.print(f"film: {written}")
+
+
+@app.command(epilog="Example: pantograph plot out/wave.npz wave.png --joint shoulder --joint elbow")
+def plot(
+    recording: RecordingFile,
+    path: Annotated[Path, typer.Argument(help="Plot: .png, .svg or .pdf.")],
+    joint: Annotated[
+        list[str] | None, typer.Option(help="Joint to draw; default: those that move most.")
+    ] = None,
+) -> None:
+    """Plot joint positions, velocities, forces and energies against time."""
+    from ..plots import plot as draw
+    from ..recording import load
+
+    console.print(f"plot: {draw(load(recording), path, joints=joint or ())}")
+
+
+@app.command(epilog="Example: pantograph new wave.toml")
+def new(path: Annotated[Path, typer.Argument(help="Scene file to write.")]) -> None:
+    """Write a commented scene to start from."""
+    if path.exists():
+        raise PantographError(f"{path} exists already; choose another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(TEMPLATE)
+    except OSError as e:
+        raise PantographError(f"cannot write {path}: {e.strerror}") from None
+    console.print(f"wrote {path}; next: pantograph run {path} --film {path.stem}.mp4")
+
+
+@app.command(epilog="Example: pantograph models arm6")
+def models(name: Annotated[str | None, typer.Argument(help="A model to describe.")] = None) -> None:
+    """List the built-in models, or describe a model: joints, actuators, sites, cameras, keyframes."""
+    from ...models import names
+
+    if name is None:
+        show.models(console, names())
+    else:
+        show.model(console, name)
+
+
+@app.command(epilog="Example: pantograph schema > scene.schema.json")
+def schema() -> None:
+    """Print the JSON Schema of scene files, for editors."""
+    from ..scene.schema import Scene
+
+    typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
+
+
+def _draw(recording: Any, film_path: Path | None, plot_path: Path | None, out: Path) -> None:
+    if plot_path is not None:
+        from ..plots import plot as draw
+
+        console.print(f"plot: {draw(recording, _in(out, plot_path))}")
+    if film_path is not None:
+        from ..shoot import shoot
+
+        console.print(f"film: {shoot(recording, _in(out, film_path))}")
+
+
+def _in(out: Path, path: Path) -> Path:
+    """A bare file name lands in the output folder, a path where it says."""
+    return out / path if path.parent == Path() else path
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise PantographError(f"a size is WIDTHxHEIGHT, as 640x480, not {text!r}")
+    return int(width), int(height)
+
+
+def _finish(recording: Any) -> None:
+    if recording.status == "done":
+        return
+    errors.print(f"[bold red]{recording.status}:[/] {escape(recording.message)}", soft_wrap=True)
+    raise typer.Exit(130 if recording.status == "interrupted" else 1)
