@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from .easings import EASINGS, evaluate_pieces
 from .errors import KeyingError, unknown
@@ -176,8 +176,8 @@ def keyed(
       - `step`: each value until the next key; `linear`;
       - `natural`: cubic spline, C2 inside, no acceleration at the ends (periodic C2 in a loop);
       - `clamped`: cubic spline, C2 inside, at rest at the ends;
-      - `auto`: monotone cubic (Fritsch & Butland 1984), C1 everywhere: at rest where the keys turn and where
-        the curve begins or ends to be held, never outside of the two keys around it.
+      - `auto`: monotone cubic (Fritsch & Butland 1984), C1 everywhere: at rest where the keys turn
+        and where the curve begins or ends to be held, never outside of the two keys around it.
     `ease`: name of an easing (`easings.EASINGS`) that times straight ways between keys, instead of a `kind`.
     `before`, `after`: `hold` the end value, or `loop` with period end - start (first and last value equal).
 
@@ -216,12 +216,30 @@ def eased_pieces(t: Array, q0: Array, dq: Array, ease: str | None) -> tuple[Arra
 
 
 def _monotone_slopes(t: Array, q: Array, loops: bool) -> Array:
-    """Limited slopes at the keys, with what lies beyond the ends as neighbours: held values, or the loop."""
-    h = np.diff(t)
-    t_around = np.concatenate([[t[0] - h[-1]], t, [t[-1] + h[0]]])
-    beyond = (q[-2], q[1]) if loops else (q[0], q[-1])
-    q_around = np.concatenate([beyond[0][None], q, beyond[1][None]])
-    return np.asarray(PchipInterpolator(t_around, q_around).derivative()(t))
+    """Slopes (k, d) at the keys: zero where the keys turn, else the limited mean of both sides."""
+    h, u = around(np.diff(t), np.diff(q, axis=0) / np.diff(t)[:, None], loops)
+    speed = limited_mean(h, np.abs(u))
+    return np.asarray(np.where(np.sign(u[:-1]) == np.sign(u[1:]), np.sign(u[1:]) * speed, 0.0))
+
+
+def around(h: Array, u: Array, loops: bool) -> tuple[Array, Array]:
+    """Lengths (m,) and slopes (m, d) of the intervals, with those before and after: still, or of the loop."""
+    still = np.zeros_like(u[:1])
+    u = np.concatenate([u[-1:] if loops else still, u, u[:1] if loops else still])
+    return np.concatenate([h[-1:], h, h[:1]]), u
+
+
+def limited_mean(h: Array, speed: Array) -> Array:
+    """Harmonic mean (k, d), at most three times either, of the speeds (k + 1, d) on both sides of a key.
+
+    1/v = (w0/s0 + w1/s1)/(w0 + w1), w0 = h0 + 2 h1, w1 = 2 h0 + h1 (Fritsch & Butland 1984).
+    """
+    s0, s1, h0, h1 = speed[:-1], speed[1:], h[:-1, None], h[1:, None]
+    w0, w1 = h0 + 2 * h1, 2 * h0 + h1
+    slower, faster = np.minimum(s0, s1), np.maximum(s0, s1)
+    ratio = np.divide(slower, faster, out=np.zeros_like(slower), where=faster > 0)
+    # Written so that no product or quotient of tiny speeds can under- or overflow.
+    return np.asarray(slower * (w0 + w1) / np.where(s0 < s1, w0 + w1 * ratio, w0 * ratio + w1))
 
 
 def check_keys(times: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:

@@ -15,7 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from .curves import Array, Beyond, Curve, Kind, check_keys, check_kind, eased_pieces, frozen
+from .curves import (
+    Array,
+    Beyond,
+    Curve,
+    Kind,
+    around,
+    check_keys,
+    check_kind,
+    eased_pieces,
+    frozen,
+    limited_mean,
+)
 from .easings import evaluate_pieces
 from .errors import KeyingError
 from .rotations import (
@@ -133,23 +144,14 @@ def _cubics(h: Array, arcs: Array, rates: Array) -> Array:
 def _limited_rates(h: Array, arcs: Array, loops: bool) -> Array:
     """Angular velocities (k, 3) at the keys that never overshoot an arc.
 
-    The harmonic mean of the speeds of both arcs (Fritsch & Butland 1984) times the mean of their directions:
-    on a common axis that is the monotone slope of numbers; its part along either arc is between 0 and three
+    The limited mean of the speeds of both arcs times the mean of their directions: on a common axis that is
+    the monotone slope of numbers; its part along either arc is between 0 and three
     times that arc's speed, the condition for monotone progress (Fritsch & Carlson 1980).
     """
-    still = np.zeros((1, 3))
-    u = arcs / h[:, None]
-    u = np.concatenate([u[-1:] if loops else still, u, u[:1] if loops else still])
-    h = np.concatenate([h[-1:], h, h[:1]])[:, None]
+    h, u = around(h, arcs / h[:, None], loops)
     speed = np.linalg.norm(u, axis=1, keepdims=True)
     direction = np.divide(u, speed, out=np.zeros_like(u), where=speed > 0)
-    w0, w1 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]
-    s0, s1 = speed[:-1], speed[1:]
-    slower, faster = np.minimum(s0, s1), np.maximum(s0, s1)
-    ratio = np.divide(slower, faster, out=np.zeros_like(slower), where=faster > 0)
-    weight = np.where(s0 < s1, w0 + w1 * ratio, w0 * ratio + w1)  # no product of speeds: it could underflow
-    speed_at_key = slower * (w0 + w1) / weight
-    return np.asarray(speed_at_key * 0.5 * (direction[:-1] + direction[1:]))
+    return np.asarray(limited_mean(h, speed) * 0.5 * (direction[:-1] + direction[1:]))
 
 
 def _spline_rates(h: Array, arcs: Array, kind: Kind, loops: bool) -> Array:
