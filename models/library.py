@@ -82,7 +82,8 @@ def _load(path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if bad:
         raise ModelError("\n".join([f"{path}: every number of a model must be finite", *bad]))
     notes: list[str] = []
-    with captured_warnings() as messages:
+    with captured_warnings() as messages, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the Python binding repeats some of the messages
         try:
             is_urdf = urdf.is_urdf(text)
             spec = urdf.parse(path, text, notes) if is_urdf else mujoco.MjSpec.from_file(str(path))

@@ -77,5 +77,4 @@ def _object(kind: str) -> mujoco.mjtObj:
 
 
 def _id(model: mujoco.MjModel, kind: str, name: str) -> int:
-    # An empty name would find the first unnamed part.
-    return int(mujoco.mj_name2id(model, _object(kind), name)) if name else -1
+    return int(mujoco.mj_name2id(model, _object(kind), name))

@@ -338,19 +338,25 @@ def test_own_models_py_does_not_shadow_ours(tmp_path):
     assert (done.returncode, done.stdout.strip()) == (0, "6"), done.stderr
 
 
-def test_loading_leaves_no_log_file_and_prints_nothing(tmp_path):
-    (tmp_path / "bad.xml").write_text(world(BALL.replace("<body", '<body name2="x" pos="0 0 0" user="nan"')))
-    (tmp_path / "note.xml").write_text(world(BALL.replace('"j"', '"nan"')))
+def test_what_mujoco_warns_becomes_a_warning_and_leaves_no_log_file(tmp_path):
+    (tmp_path / "child.xml").write_text(mjcf(f'<option integrator="RK4"/><worldbody>{BALL}</worldbody>'))
+    (tmp_path / "parent.xml").write_text(
+        mjcf(
+            '<asset><model name="child" file="child.xml"/></asset>'
+            '<worldbody><attach model="child" body="ball" prefix="a_"/></worldbody>'
+        )
+    )
     code = (
-        "import warnings; warnings.simplefilter('ignore')\n"
+        "import warnings\n"
         "from pantograph import models\n"
-        "for name in ('bad.xml', 'note.xml'):\n"
-        "    try: models.load_model(name)\n"
-        "    except models.ModelError: pass\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        "    models.load_model('parent.xml')\n"
+        "print([w.category.__name__ for w in caught], 'integrator' in str(caught[0].message))"
     )
     done = run_python(code, tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.xml", "note.xml"]
+    assert (done.returncode, done.stdout, done.stderr) == (0, "['ModelWarning'] True\n", "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["child.xml", "parent.xml"]
 
 
 def test_captured_warnings_restores_what_was_there():

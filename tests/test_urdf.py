@@ -56,6 +56,7 @@ def test_urdf_with_a_floating_base(tmp_path):
     "reference",
     [
         "package://small_description/meshes/wheel.stl",
+        "package://another_name/meshes/wheel.stl",
         "../meshes/wheel.stl",
         "wheel.stl",
         "file://{root}/meshes/wheel.stl",
@@ -138,6 +139,17 @@ def test_urdf_says_what_it_changed(tmp_path, text, says):
     with pytest.warns(models.ModelWarning, match=says):
         model = models.load_model(tmp_path / "small.urdf")
     assert model.nv == 1
+
+
+def test_visuals_weigh_nothing(tmp_path):
+    shapes = "".join(
+        f'<{part}><geometry><box size="{side} {side} {side}"/></geometry></{part}>'
+        for part, side in (("visual", 0.3), ("collision", 0.2))
+    )
+    (tmp_path / "small.urdf").write_text(re.sub(r"(?s)<inertial>.*</inertial>", shapes, urdf()))
+    with pytest.warns(models.ModelWarning, match="1000 kg"):
+        model = models.load_model(tmp_path / "small.urdf")
+    assert model.body_mass.sum() == pytest.approx(1000 * 0.2**3)
 
 
 def test_urdf_settings_of_the_file_win(tmp_path):
