@@ -73,6 +73,7 @@ class _Run:
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.data = mujoco.MjData(self.model)
         self.timed = Timed(problem)
+        self.chunk_first = -1
         self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
         self.quat = _quaternion_joints(self.model)
         self.evaluations = 0
@@ -132,70 +133,74 @@ class _Run:
             mujoco.mj_step(self.model, self.data, n)
             self.evaluations += n * (4 if self.problem.integrator == "rk4" else 1)
             return
-        for first in range(k, k + n, _CHUNK):
-            count = min(_CHUNK, k + n - first)
-            if self.problem.integrator == "rk4":
-                self._runge_kutta(first, count)
-            else:
-                self._native(first, count)
+        advance = self._runge_kutta if self.problem.integrator == "rk4" else self._native
+        for step in range(k, k + n):
+            advance(step)
 
-    def _runge_kutta(self, k: int, n: int) -> None:
+    def _inputs(self, k: int) -> tuple[tuple[TimedInputs, TimedInputs, TimedInputs], int]:
+        """Prescribed inputs at the start, the middle and the end of a chunk of steps, and the row of step
+        ``k`` in them. The end is the limit from the left: keys may bend there."""
+        first = k - k % _CHUNK
+        if first != self.chunk_first:
+            n, h = min(_CHUNK, self.steps - first), self.h
+            begin = self.t0 + np.arange(first, first + n) * h
+            end = self.t0 + np.arange(first + 1, first + n + 1) * h
+            self.chunk = (self.timed.at(begin), self.timed.at(begin + h / 2), self.timed.at(end, left=True))
+            self.chunk_first = first
+        return self.chunk, k - first
+
+    def _runge_kutta(self, k: int) -> None:
         """Classical RK4 whose stages see the prescribed inputs at their own times.
 
         Orientation is integrated as the quaternion ODE qdot = q * (0, w) / 2 and normalised after the
-        step, which keeps order 4. A step's last stage takes the limit from the left, where keys may bend.
+        step, which keeps order 4.
         """
         h, d = self.h, self.data
-        begin = self.t0 + np.arange(k, k + n) * h
-        stages = (
-            self.timed.at(begin),
-            self.timed.at(begin + h / 2),
-            self.timed.at(self.t0 + np.arange(k + 1, k + n + 1) * h, left=True),
-        )
-        for i in range(n):
-            q0, v0, act0 = d.qpos.copy(), d.qvel.copy(), d.act.copy()
-            rates: list[tuple[Array, Array, Array]] = []
-            for inputs, c in zip(
-                (stages[0], stages[1], stages[1], stages[2]), (0.0, 0.5, 0.5, 1.0), strict=True
-            ):
-                if rates:
-                    dq, dv, dact = rates[-1]
-                    d.qpos[:], d.qvel[:], d.act[:] = q0 + c * h * dq, v0 + c * h * dv, act0 + c * h * dact
-                d.time = self.t0 + (k + i + c) * h
-                self._prescribe_state(inputs, i)
-                self._apply(inputs, i)
-                self.prescriber.forward(d, self.held.qfrc, inputs.a[i])
-                rates.append((self._qdot(), d.qacc.copy(), d.act_dot.copy()))
-            weights = (h / 6, h / 3, h / 3, h / 6)
-            d.qpos[:] = q0 + sum(w * r[0] for w, r in zip(weights, rates, strict=True))
-            d.qvel[:] = v0 + sum(w * r[1] for w, r in zip(weights, rates, strict=True))
-            d.act[:] = act0 + sum(w * r[2] for w, r in zip(weights, rates, strict=True))
-            mujoco.mj_normalizeQuat(self.model, d.qpos)
-            self.evaluations += 4
-        self._land(k + n)
+        (begin, middle, end), row = self._inputs(k)
+        q0, v0, act0 = d.qpos.copy(), d.qvel.copy(), d.act.copy()
+        rates: list[tuple[Array, Array, Array]] = []
+        for inputs, c in zip((begin, middle, middle, end), (0.0, 0.5, 0.5, 1.0), strict=True):
+            if rates:
+                dq, dv, dact = rates[-1]
+                d.qpos[:], d.qvel[:], d.act[:] = q0 + c * h * dq, v0 + c * h * dv, act0 + c * h * dact
+            d.time = self.t0 + (k + c) * h
+            self._prescribe_state(inputs, row)
+            self._apply(inputs, row)
+            self.prescriber.forward(d, self.held.qfrc, inputs.a[row])
+            rates.append((self._qdot(), d.qacc.copy(), d.act_dot.copy()))
+        weights = (h / 6, h / 3, h / 3, h / 6)
+        d.qpos[:] = q0 + sum(w * r[0] for w, r in zip(weights, rates, strict=True))
+        d.qvel[:] = v0 + sum(w * r[1] for w, r in zip(weights, rates, strict=True))
+        d.act[:] = act0 + sum(w * r[2] for w, r in zip(weights, rates, strict=True))
+        mujoco.mj_normalizeQuat(self.model, d.qpos)
+        self.evaluations += 4
+        self._land(k + 1)
 
-    def _native(self, k: int, n: int) -> None:
+    def _native(self, k: int) -> None:
         """MuJoCo's one-stage integrators; keyed joints get the mean acceleration over the step."""
-        h, d = self.h, self.data
-        inputs = self.timed.at(self.t0 + np.arange(k, k + n + 1) * h)
-        p = self.prescriber
-        for i in range(n):
-            self._prescribe_state(inputs, i)
-            self._apply(inputs, i)
-            d.qfrc_applied[:] = self.held.qfrc
-            a_key = (inputs.v[i + 1] - inputs.v[i]) / h
-            if len(p.keyed):
-                d.qfrc_applied[p.keyed] = p.armature * a_key + p.lag
-            mujoco.mj_step(self.model, d)
-            if len(p.keyed):
-                p.lag = p.lag + p.armature * (a_key - d.qacc[p.keyed])
-            self.evaluations += 1
-        self._prescribe_state(inputs, n)
+        h, d, p = self.h, self.data, self.prescriber
+        (begin, _, end), row = self._inputs(k)
+        self._prescribe_state(begin, row)
+        self._apply(begin, row)
+        d.qfrc_applied[:] = self.held.qfrc
+        a_key = (end.v[row] - begin.v[row]) / h
+        if len(p.keyed):
+            d.qfrc_applied[p.keyed] = p.armature * a_key + p.lag
+        mujoco.mj_step(self.model, d)
+        if len(p.keyed):
+            p.lag = p.lag + p.armature * (a_key - d.qacc[p.keyed])
+        self.evaluations += 1
+        self._land(k + 1)
 
     def _land(self, k: int) -> None:
         """Put keyed joints where their keys say at the start of step ``k``, free of rounding drift."""
         self.data.time = self.t0 + k * self.h
-        self._prescribe_state(self.timed.at(np.array([self.data.time])), 0)
+        if k < self.steps:
+            (begin, _, _), row = self._inputs(k)
+            self._prescribe_state(begin, row)
+        else:
+            (_, _, end), row = self._inputs(k - 1)
+            self._prescribe_state(end, row)
 
     def _prescribe_state(self, inputs: TimedInputs, row: int) -> None:
         self.data.qpos[self.timed.qpos] = inputs.q[row]

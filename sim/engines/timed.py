@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...models import name_of
+from ..clip import Clip
 from .interface import Array, Drive, Problem, Role
 
 
@@ -32,6 +34,11 @@ class Timed:
         self.problem = problem
         self.keyed = np.flatnonzero(problem.dofs(Role.KEYED))
         self.qpos = np.flatnonzero(keyed_qpos(problem))
+        joints = {
+            name_of(problem.model, "joint", int(j)) for j in np.flatnonzero(problem.roles == Role.KEYED)
+        }
+        clip = problem.clip
+        self.clip = Clip(clip.model, {n: t for n, t in clip.tracks.items() if n in joints}, clip.q0)
         self.servos = np.array(sorted(problem.servo), dtype=int)
         self.bodies = np.array([w.body for w in problem.wrenches], dtype=int)
         self.body_frame = np.array([w.in_body_frame for w in problem.wrenches], dtype=bool)
@@ -47,7 +54,7 @@ class Timed:
         n, k = len(t), len(self.keyed)
         q, v, a = np.zeros((n, len(self.qpos))), np.zeros((n, k)), np.zeros((n, k))
         if k:
-            motion = self.problem.clip.evaluate(t, left=left)
+            motion = self.clip.evaluate(t, left=left)
             q, v, a = motion.q[:, self.qpos], motion.v[:, self.keyed], motion.a[:, self.keyed]
         ctrl = np.zeros((n, len(self.servos)))
         for i, actuator in enumerate(self.servos):
