@@ -190,7 +190,9 @@ def _mapping(
     x, y, z = (float(s) for s in model.geom_size[geom])
     if kind in (types.mjGEOM_SPHERE, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
         x, y, z = x, x, x if kind == types.mjGEOM_SPHERE else y
-    if kind in (types.mjGEOM_MESH, types.mjGEOM_SDF, types.mjGEOM_HFIELD):
+    if kind == types.mjGEOM_HFIELD:
+        x, y = (float(s) for s in model.hfield_size[int(model.geom_dataid[geom])][:2])
+    if kind in (types.mjGEOM_MESH, types.mjGEOM_SDF):
         return (repeat_x, repeat_y), (x, y, z) if uniform else (1.0, 1.0, 1.0)
     x, y, z = x or 1.0, y or 1.0, z or 1.0
     scale = (repeat_x * x, repeat_y * y) if uniform else (repeat_x, repeat_y)

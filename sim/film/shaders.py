@@ -167,8 +167,7 @@ void main() {{
     vec3 to_eye = eye - p;
     float distance_to_eye = length(to_eye);
     vec3 v = to_eye / distance_to_eye;
-    vec3 m = normalize(n);
-    if (dot(m, v) < 0.0) m = -m;
+    vec3 m = normalize(gl_FrontFacing ? n : -n);
     vec3 albedo = base.rgb;
     float alpha = base.a;
 {read}
