@@ -174,7 +174,9 @@ class VirtualServo:
         self.memory.put("bus_watchdog", -1)
         self.memory.put("profile_velocity", 0)
         self.memory.put("profile_acceleration", 0)
-        self.memory.put("goal_velocity", 0)
+        goal = GOALS_OF_MODE[self.memory.get("operating_mode")]
+        if goal != "goal_position":
+            self.memory.put(goal, 0)
         self._apply_settings()
         self.drive.halt()
 
@@ -225,6 +227,7 @@ class VirtualServo:
             memory.put("backup_ready", int(self._backup is not None))
         self._latched, self._registered, self._overload = 0, None, 0.0
         self.drive.halted = False
+        self.drive.settings.reverse = bool(memory.get("drive_mode") & 1)
         self._apply_settings()
         self._reset_turns()
         self._default_goals()
@@ -262,6 +265,7 @@ class VirtualServo:
         """Let the drive follow the registers; called after every change of one."""
         watchdog = self.memory.get("bus_watchdog")
         self._watchdog_period = watchdog * 0.02 if watchdog > 0 else 0.0
+        self._fresh = -1.0
         self.drive.settings = settings(self.memory, reverse=self.drive.settings.reverse)
 
     def _torque(self, on: bool) -> None:
@@ -468,7 +472,6 @@ class VirtualServo:
         self._factory()
         for name, raw in kept.items():
             self.memory.put(name, raw)
-        self.drive.settings.reverse = False
         self._reboot()
         return StatusError.NONE
 
