@@ -82,15 +82,17 @@ def _load(path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if bad:
         raise ModelError("\n".join([f"{path}: every number of a model must be finite", *bad]))
     notes: list[str] = []
-    with captured_warnings() as messages, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the Python binding repeats some of the messages
+    with captured_warnings() as messages, warnings.catch_warnings(record=True) as fuller:
+        warnings.simplefilter("always")  # MuJoCo's Python binding repeats some messages, with their details
         try:
             is_urdf = urdf.is_urdf(text)
             spec = urdf.parse(path, text, notes) if is_urdf else mujoco.MjSpec.from_file(str(path))
             model = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             raise explain(path, str(error)) from error
-    for note in [*notes, *_upside_down(model), *messages]:
+    detailed = [str(warning.message) for warning in fuller]
+    plain = [message for message in messages if not any(text.startswith(message) for text in detailed)]
+    for note in [*notes, *_upside_down(model), *detailed, *plain]:
         warnings.warn(f"{path}: {note}", ModelWarning, stacklevel=3)
     return spec, model
 
