@@ -125,8 +125,8 @@ def forward_fragment(lights: Sequence[tuple[str, int]], *, texture: str, ground:
     read = {
         "none": "",
         "checker": "    albedo *= checker(texture_uv);",
-        "2d": "    vec4 texel = texture(image, texture_uv);\n    albedo *= texel.rgb * texel.rgb;\n    alpha *= texel.a;",
-        "cube": "    vec3 texel = texture(image, cube_direction).rgb; albedo *= texel * texel;",
+        "2d": "    vec4 ink = texture(image, texture_uv); albedo *= ink.rgb * ink.rgb; alpha *= ink.a;",
+        "cube": "    vec3 ink = texture(image, cube_direction).rgb; albedo *= ink * ink;",
     }[texture]
     haze = "    shown = mix(shown, sky(-v), smoothstep(haze.x, haze.y, distance_to_eye));" if ground else ""
     body = "".join(_light(i, kind, shadow) for i, (kind, shadow) in enumerate(lights))

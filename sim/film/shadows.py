@@ -8,7 +8,7 @@ from .lights import LitNow
 
 Floats = NDArray[np.floating]
 
-_WIDEST = np.deg2rad(120.0)  # of a perspective map; wider ones waste their texels on the rim
+_WIDEST = float(np.deg2rad(120.0))  # of a perspective map; wider ones waste their texels on the rim
 _TO_TEXTURE = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
 
 
@@ -38,17 +38,17 @@ def shadow_view(light: LitNow, centers: Floats, radii: Floats, *, size: int) -> 
             aim = np.array([0.0, 0.0, -1.0])
         X_WL = look_at(light.position, light.position + aim)
         away = -(centers - light.position) @ X_WL[:3, 2]
-        distance = np.linalg.norm(middle - light.position)
+        distance = float(np.linalg.norm(middle - light.position))
         bound = float((np.linalg.norm(centers - middle, axis=1) + radii).max())
         if light.kind == "spot":
-            angle = 2 * np.arccos(light.cos_cutoff) * 1.02
+            angle = 2 * float(np.arccos(light.cos_cutoff)) * 1.02
         else:
-            angle = 2 * np.arcsin(min(bound / max(distance, 1e-9), 1.0)) * 1.02
+            angle = 2 * float(np.arcsin(min(bound / max(distance, 1e-9), 1.0))) * 1.02
         angle = min(angle, _WIDEST)
         far = max(float((away + radii).max()), 1e-3)
         near = max(float((away - radii).min()), far * 1e-2)
         P = perspective(angle, 1.0, near, far)
-        texel = 2 * np.tan(angle / 2) * max(float(distance), near) / size
+        texel = 2 * np.tan(angle / 2) * max(distance, near) / size
     VP = P @ inverse(X_WL)
     return VP, _TO_TEXTURE @ VP, float(texel)
 

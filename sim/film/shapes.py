@@ -1,6 +1,7 @@
 """Triangles, normals and texture coordinates of every MuJoCo geom type, in the geom's frame."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -107,7 +108,7 @@ def _cylinder(radius: float, half: float) -> Shape:
     normal_r, normal_z = np.array([0.0, 0, 1, 1, 0, 0]), np.array([-1.0, -1, 0, 0, 1, 1])
     whole = _revolved(r, z, normal_r, normal_z, (1 - z / half) / 2)
     lids = np.abs(whole.normals[:, 2:]) > 0.5
-    uv = np.where(lids, 0.5 + whole.positions[:, :2] / (2 * radius), whole.uv)
+    uv = np.where(lids, 0.5 + whole.positions[:, :2] / (2 * radius), np.asarray(whole.uv))
     return Shape(whole.positions, whole.normals, whole.indices, uv)
 
 
@@ -156,7 +157,7 @@ def _height_field(model: mujoco.MjModel, field: int) -> Shape:
 
 
 def _mesh(model: mujoco.MjModel, mesh: int) -> Shape:
-    def block(data: NDArray[np.generic], start: NDArray[np.integer], count: NDArray[np.integer]) -> Floats:
+    def block(data: Any, start: Any, count: Any) -> NDArray[Any]:
         return np.asarray(data[int(start[mesh]) : int(start[mesh]) + int(count[mesh])])
 
     vertices = block(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum).astype(float)
@@ -201,7 +202,7 @@ def crease_normals(vertices: Floats, faces: NDArray[np.integer], crease: float) 
         total[there] += area_normal[face[here]]
     norm = np.linalg.norm(total, axis=1, keepdims=True)
     total = np.divide(total, norm, out=np.tile([0.0, 0, 1], (len(total), 1)), where=norm > 0)
-    normals = np.empty_like(total)
+    normals: Floats = np.empty_like(total)
     normals[order] = total
     return normals.reshape(-1, 3, 3)
 

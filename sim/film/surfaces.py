@@ -37,7 +37,7 @@ class Surface:
         self._now = self._levels[0][1]
 
     def place(self, X_WG: NDArray[np.float32], eye: Floats, pixel_slope: float) -> None:
-        """Send poses (ngeom, 4, 4), columns first; `pixel_slope`: metres a pixel spans per metre of distance."""
+        """Send poses (ngeom, 4, 4), columns first; `pixel_slope`: metres per pixel, per metre of distance."""
         from OpenGL import GL
 
         poses = X_WG[self.batch.geoms]

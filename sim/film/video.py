@@ -8,7 +8,8 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ def write(
     the KeyboardInterrupt goes on; on any other error nothing is left. `total` is the number of frames to
     come, for the time left on the progress bar, which shows on terminals only.
 
-    Raises FilmError for an unknown suffix, no frames, frames of unequal size, or a path that cannot be written.
+    Raises FilmError for an unknown suffix, no frames, frames of unequal size, or an unwritable path.
     """
     target = Path(path)
     if fps <= 0:
@@ -59,8 +60,8 @@ def write(
         writer = _write_still
     else:
         raise FilmError(
-            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, PNG frames as 'name_%04d.png' "
-            f"or a folder; stills: {', '.join(_STILLS)}"
+            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, frames as 'name_%04d.png' or "
+            f"a folder; stills: {', '.join(_STILLS)}"
         )
     shown = _with_progress(frames, total, target.name) if progress else iter(frames)
     try:
@@ -104,23 +105,23 @@ def _aside(target: Path) -> Iterator[Path]:
     aside.replace(target)
 
 
-class _Interruptible:
-    """Iterates frames; a KeyboardInterrupt ends the iteration, and `reraise` brings it back later."""
+class _Kept:
+    """Context in which Ctrl-C only ends the work, once `frames` have been done; `reraise` lets it go on."""
 
-    def __init__(self, frames: Iterator[Frame]) -> None:
-        self._frames = frames
-        self._interrupt: KeyboardInterrupt | None = None
-        self.count = 0
+    def __init__(self) -> None:
+        self.frames = 0
+        self._interrupt: BaseException | None = None
 
-    def __iter__(self) -> Iterator[Frame]:
-        try:
-            for frame in self._frames:
-                yield frame
-                self.count += 1
-        except KeyboardInterrupt as interrupt:
-            if not self.count:
-                raise
-            self._interrupt = interrupt
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        if isinstance(error, KeyboardInterrupt) and self.frames:
+            self._interrupt = error
+            return True
+        return False
 
     def reraise(self) -> None:
         if self._interrupt is not None:
@@ -131,11 +132,12 @@ def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
     import av
     from av.video.reformatter import Colorspace
 
-    source = _Interruptible(frames)
-    with _aside(target) as aside:
-        with av.open(str(aside), "w", options={"movflags": "faststart"}) as container:
-            stream: Any = None
-            for frame in source:
+    kept = _Kept()
+    options = {"movflags": "faststart"}
+    with _aside(target) as aside, av.open(str(aside), "w", format="mp4", options=options) as container:
+        stream: Any = None
+        with kept:
+            for frame in frames:
                 even = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
                 if stream is None:
                     stream = container.add_stream("libx264", rate=_rate(fps))
@@ -143,54 +145,61 @@ def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
                     stream.pix_fmt = "yuv420p"
                     stream.options = {"crf": "18", "preset": "veryfast"}
                     for name in ("colorspace", "color_primaries", "color_trc"):
-                        setattr(
-                            stream.codec_context, name, 1
-                        )  # BT.709, which players assume for clear pictures
+                        setattr(stream.codec_context, name, 1)  # BT.709, the colours of clear pictures
                 picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(
                     format="yuv420p", dst_colorspace=Colorspace.ITU709
                 )
                 container.mux(stream.encode(picture))
-            container.mux(stream.encode(None))
-    source.reraise()
+                kept.frames += 1
+        container.mux(stream.encode(None))
+    kept.reraise()
 
 
 def _write_gif(target: Path, frames: Iterator[Frame], fps: float) -> None:
     import av
     from PIL import Image
 
-    source = _Interruptible(frames)
+    kept = _Kept()
     with _aside(target) as aside, tempfile.TemporaryFile() as spool:
-        palette, sizes, shape = _spool(source, spool)
+        palette, sizes, shape = _spool(frames, spool, kept)
+        colors = np.full((256, 4), 255, dtype=np.uint8)
+        listed = np.array(palette.getpalette(), dtype=np.uint8).reshape(-1, 3)
+        colors[: len(listed), 1:] = listed
         with av.open(str(aside), "w", format="gif") as container:
             stream: Any = container.add_stream("gif", rate=_rate(fps))
             stream.height, stream.width = shape[:2]
             stream.pix_fmt = "pal8"
-            colors = np.full((256, 4), 255, dtype=np.uint8)
-            listed = np.array(palette.getpalette(), dtype=np.uint8).reshape(-1, 3)
-            colors[: len(listed), 1:] = listed[:, ::1]
             spool.seek(0)
-            for size in sizes:
-                pixels = np.frombuffer(zlib.decompress(spool.read(size)), dtype=np.uint8).reshape(shape)
-                indexed = Image.fromarray(pixels).quantize(
-                    palette=palette, dither=Image.Dither.FLOYDSTEINBERG
-                )
-                picture = av.VideoFrame.from_ndarray((np.asarray(indexed), colors), format="pal8")
-                container.mux(stream.encode(picture))
+            written = _Kept()
+            with written:
+                for size in sizes:
+                    pixels = np.frombuffer(zlib.decompress(spool.read(size)), dtype=np.uint8).reshape(shape)
+                    indexed = Image.fromarray(pixels).quantize(palette=palette)
+                    indices: Any = (np.asarray(indexed), colors)
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(indices, format="pal8")))
+                    written.frames += 1
             container.mux(stream.encode(None))
-    source.reraise()
+    kept.reraise()
+    written.reraise()
 
 
-def _spool(frames: Iterable[Frame], spool: Any) -> tuple[Any, list[int], tuple[int, ...]]:
+def _spool(frames: Iterable[Frame], spool: IO[bytes], kept: _Kept) -> tuple[Any, list[int], tuple[int, ...]]:
     """Store frames compressed; a palette (Pillow image) for them all, their stored sizes, their shape."""
     from PIL import Image
 
-    samples, sizes, shape, stride = [], [], (0, 0, 3), 61
-    for frame in frames:
-        shape = frame.shape
-        sizes.append(spool.write(zlib.compress(np.ascontiguousarray(frame), 1)))
-        samples.append(frame.reshape(-1, 3)[len(sizes) % stride :: stride])
-        if sum(map(len, samples)) > 2_000_000:  # a long film: thin the samples, take fewer from now on
-            samples, stride = [sample[::2] for sample in samples[::2]], 4 * stride
+    samples: list[Frame] = []
+    sizes: list[int] = []
+    shape: tuple[int, ...] = (0, 0, 3)
+    stride = 61
+    with kept:
+        for frame in frames:
+            shape = frame.shape
+            stored = spool.write(zlib.compress(frame.tobytes(), 1))
+            samples.append(frame.reshape(-1, 3)[kept.frames % stride :: stride])
+            if sum(map(len, samples)) > 2_000_000:  # a long film: thin the samples, take fewer from now on
+                samples, stride = [sample[::2] for sample in samples[::2]], 4 * stride
+            sizes.append(stored)
+            kept.frames += 1
     pixels = np.concatenate(samples)
     return Image.fromarray(pixels[None]).quantize(256, method=Image.Quantize.MEDIANCUT), sizes, shape
 
@@ -221,7 +230,7 @@ def _write_still(target: Path, frames: Iterator[Frame], fps: float) -> None:
     frame = next(frames)
     if next(frames, None) is not None:
         raise FilmError(
-            f"{target} holds one picture; for the frames of a film name it '{target.stem}_%04d{target.suffix}'"
+            f"{target} holds one picture; name the frames of a film '{target.stem}_%04d{target.suffix}'"
         )
     with _aside(target) as aside:
         Image.fromarray(frame).save(aside)
