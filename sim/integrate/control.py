@@ -109,12 +109,16 @@ class AdaptiveSteps:
 
 
 def diverged(step: Step) -> End:
-    """The failure of a step whose state or slopes are not finite."""
+    """The failure of a step whose state or slopes are not finite, by the first component that went."""
+    method = step.method
+    for c, slopes in zip(method.c, step.K[: method.stages], strict=True):
+        if len(bad := np.flatnonzero(~np.isfinite(slopes))):
+            return End(
+                Status.DIVERGED, f"component {bad[0]} of f is not finite at t = {step.t + c * step.h:.9g} s"
+            )
     bad = np.flatnonzero(~np.isfinite(step.y_end))
-    where = f"component {bad[0]} of the state" if len(bad) else "a stage"
-    return End(
-        Status.DIVERGED, f"{where} is not finite in the step from t = {step.t:.9g} s to {step.t_end:.9g} s"
-    )
+    where = f"component {bad[0]} of the state" if len(bad) else "the error estimate"
+    return End(Status.DIVERGED, f"{where} is not finite at t = {step.t_end:.9g} s")
 
 
 def error_norm(step: Step, rtol: float, atol: Array) -> float:
@@ -180,7 +184,7 @@ def steps_for(
     if step is not None:
         if rtol is not None or atol is not None:
             raise EngineError(
-                f"step={step} asks for fixed steps, rtol={rtol} and atol={atol} for steps by tolerance: give one"
+                f"step={step} asks for fixed steps, rtol={rtol}, atol={atol} for steps by tolerance: give one"
             )
         return FixedSteps(fixed_grid(span, step))
     if not method.adaptive:
@@ -197,13 +201,13 @@ def tolerances(rtol: float | None, atol: float | Array | None) -> tuple[float, A
     """Both tolerances from what was given: a missing one equals the other, 1e-6 where neither is.
 
     Raises:
-        EngineError: negative, both zero, or finer than doubles.
+        EngineError: `atol` is not positive, or `rtol` negative or finer than doubles.
     """
     if rtol is None:
         rtol = 1e-6 if atol is None else float(np.min(atol))
     absolute = np.asarray(rtol if atol is None else atol, dtype=np.float64)
-    if not (rtol >= 0 and np.all(absolute >= 0) and rtol + np.min(absolute) > 0):
-        raise EngineError(f"rtol={rtol}, atol={atol}: tolerances must not be negative, nor both zero")
+    if not (rtol >= 0 and np.all(absolute > 0)):
+        raise EngineError(f"rtol={rtol}, atol={atol}: atol must be positive and rtol not negative")
     if 0 < rtol < 10 * EPS:
         raise EngineError(f"rtol={rtol} is below what doubles resolve: give at least {10 * EPS:.1e}")
     return rtol, absolute

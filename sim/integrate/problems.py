@@ -121,20 +121,21 @@ class MujocoProblem:
 
 def constraints_of(model: mujoco.MjModel) -> list[str]:
     """What in the model MuJoCo treats as a constraint, in words; empty when its dynamics is smooth."""
+    from ..plan import can_touch  # plan knows the integrators too
+
     off = model.opt.disableflags
     flag = mujoco.mjtDisableBit
 
     def on(*bits: int) -> bool:
         return not any(off & int(bit) for bit in (flag.mjDSBL_CONSTRAINT, *bits))
 
-    touching = np.logical_and.outer(model.geom_contype, model.geom_conaffinity).any() or model.npair > 0
     limits = int(model.jnt_limited.sum() + model.tendon_limited.sum())
     friction = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
     found = {
         f"{model.neq} equality constraint(s)": model.neq > 0 and on(flag.mjDSBL_EQUALITY),
         f"{limits} joint or tendon limit(s)": limits > 0 and on(flag.mjDSBL_LIMIT),
         f"dry friction in {friction} joint(s) or tendon(s)": friction > 0 and on(flag.mjDSBL_FRICTIONLOSS),
-        "geoms that may touch": model.ngeom > 1 and touching and on(flag.mjDSBL_CONTACT),
+        "geoms that may touch": on(flag.mjDSBL_CONTACT) and can_touch(model),
     }
     return [words for words, present in found.items() if present]
 
