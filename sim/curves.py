@@ -116,10 +116,13 @@ class Curve(ABC):
         """Breaks and the order of the lowest derivative that jumps there."""
         before, after = self(self.knots, left=True), self(self.knots)
         order = np.full(self.knots.shape, 3)
+        h = np.concatenate([[np.inf], np.diff(self.knots), [np.inf]])
+        h = np.minimum(h[:-1], h[1:])  # what rounding of positions is divided by in rates
         for k in (2, 1, 0):
             scale = max(np.abs(before[k]).max(), np.abs(after[k]).max())
+            rounding = 1e-12 * np.abs(self.values).max() / h**k
             jump = self._distance(before[k], after[k]) if k == 0 else np.abs(after[k] - before[k]).max(axis=1)
-            order[jump > _SAME * scale] = k
+            order[jump > np.maximum(_SAME * scale, rounding)] = k
         found = order < 3
         return frozen(self.knots[found]), order[found]
 

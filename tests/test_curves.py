@@ -35,10 +35,17 @@ def curves(draw, shape=shapes, min_keys=1):
 
 
 def scales(curve):
-    """Sizes of q, v and a over a curve, as yardsticks for rounding."""
-    h = np.diff(curve.times).min(initial=np.inf)
+    """Sizes of q, v and a over a curve and of the terms they are sums of, as yardsticks for rounding."""
+    h = np.diff(curve.knots)[:, None]
+    power = np.arange(len(curve.coefficients) - 1, -1, -1)[:, None, None]
+    q = np.abs(curve.coefficients) * h**power
+    terms = q, q * power / h, q * power * (power - 1) / h**2
     size = 1e-30 + np.abs(curve.values).max()
-    return size, 10 * size / h, 60 * size / h**2
+    h = h.min(initial=np.inf)
+    return tuple(
+        floor + x.sum(axis=0).max(initial=0)
+        for floor, x in zip((size, 1e-3 * size / h, 1e-3 * size / h**2), terms, strict=True)
+    )
 
 
 def test_reference_values_of_cubic_splines():
