@@ -3,7 +3,6 @@
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
 from pantograph.hardware import packets as p
 from pantograph.hardware.packets import Fault, Packet, PacketError, Parser
 

@@ -6,7 +6,6 @@ from math import pi
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from pantograph.hardware.errors import RegisterError
 from pantograph.hardware.registers import Register, control_table, model_names
 from pantograph.hardware.tables.wheel import DISAGREEMENTS
@@ -20,7 +19,7 @@ ROWS = [r for m in MODELS for r in control_table(m).registers]
 
 
 def alias(name: str, model: str) -> str:
-    """Row that a name of the wheel stands for: `read` is the 7th entry of the small models, the 29th of the others."""
+    """Row that a name of the wheel stands for: `read` is entry 7 of the small models, 29 of the others."""
     second = "7" if control_table(model).size == 228 else "29"
     return ALIASES.get(name, name.replace("_read", f"_{second}") if name.startswith("indirect") else name)
 
@@ -185,7 +184,7 @@ def test_messages_name_the_register_and_what_exists():
         control_table("xl430-w250")["goal_current"]
     with pytest.raises(RegisterError, match=r"'xm430-350'.*did you mean 'xm430-w350'"):
         control_table("xm430-350")
-    with pytest.raises(RegisterError, match="999.*1020 xm430-w350"):
+    with pytest.raises(RegisterError, match=r"999.*1020 xm430-w350"):
         control_table(999)
     with pytest.raises(RegisterError, match="has 4 bytes, got 2"):
         control_table("xl430-w250")["goal_position"].decode(b"\0\0")

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
-
 from pantograph.hardware import packets as p
 from pantograph.hardware.errors import HardwareError
 from pantograph.hardware.packets import ALERT, StatusError
@@ -23,6 +21,7 @@ from pantograph.hardware.virtual.profile import (
     timed,
     trapezoid,
 )
+from scipy.linalg import expm
 
 OK = StatusError.NONE
 positive = st.floats(0.05, 20)
@@ -467,11 +466,7 @@ def test_status_return_level(level, answers):
     servo.memory.put("status_return_level", level)
     replies = (servo.execute(p.ping(1)), servo.execute(p.read(1, 7, 1)), servo.execute(p.write(1, 65, b"\1")))
     assert tuple(r is not None for r in replies) == answers
-    assert read_led(servo) == 1
-
-
-def read_led(servo: VirtualServo) -> int:
-    return servo.get("led")
+    assert servo.get("led") == 1
 
 
 def test_indirect_registers_map_byte_by_byte():

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from ..errors import HardwareError
-from ..packets import BROADCAST, HEADER, Instruction, Packet, Parser, crc16, status
+from ..packets import BROADCAST, HEADER, MAX_LENGTH, Instruction, Packet, Parser, crc16, status
 from .drive import PERIOD
 from .faults import NO_FAULTS, FaultDice, FaultPlan, Upset
 from .servo import ENCODER, OVERHEATING, OVERLOAD, SHOCK, VOLTAGE, VirtualServo
@@ -217,6 +217,8 @@ class VirtualBus:
         for servo in hearing:
             servo.feed()
         now = self.time
+        if packet.instruction >= Instruction.SYNC_READ and packet.id != BROADCAST:
+            return now  # instructions to a group go to the broadcast ID alone
         match packet.instruction:
             case Instruction.SYNC_WRITE | Instruction.BULK_WRITE:
                 _group_write(hearing, packet)
@@ -257,6 +259,8 @@ class VirtualBus:
         """The common frame of a fast read; it breaks off at the first servo that is missing or too old."""
         requests = list(wanted(packet))
         length = 1 + sum(4 + n for _, _, n in requests)
+        if length > MAX_LENGTH:
+            return now
         frame = HEADER + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((Instruction.STATUS,))
         first: VirtualServo | None = None
         for id, address, size in requests:
