@@ -191,9 +191,7 @@ def _guessed_masses(robot: ET.Element) -> list[str]:
 
 def _draw_visuals(spec: mujoco.MjSpec) -> None:
     for body in spec.bodies:
-        visuals = [geom for geom in body.geoms if geom.contype == 0 and geom.conaffinity == 0]
-        for geom in body.geoms:
-            if geom in visuals:
-                geom.mass = 0
-            elif visuals:
+        solid = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        if len(solid) < len(body.geoms):
+            for geom in solid:
                 geom.group = _COLLISION_GROUP

@@ -73,6 +73,7 @@ BROKEN = {
         ["broken.xml", "finite", ":3: mass='NaN'"],
     ),
     "infinity": (world(BALL.replace("<body", '<body pos="0 -inf 0"')), ["finite", ":3: pos='0 -inf 0'"]),
+    "NaN limit": (world(BALL.replace("<joint", '<joint range="0 nan"')), ["finite", ":3: range='0 nan'"]),
     "massless": (
         world('<body name="arm"><joint/></body>'),
         ["broken.xml:3", "mass", "'arm'", "give it a geom with mass"],
@@ -311,6 +312,13 @@ def test_lookup_names_and_indices_agree():
         models.lookup(model, "joint", "")
     with pytest.raises(models.ModelError, match=r"no kind 'bone'.*body, camera"):
         models.lookup(model, "bone", "j")
+
+
+def test_a_servo_with_several_inputs_is_one_actuator():
+    servos = '<actuator><pid name="servo" joint="j" kp="1"/><motor name="motor" joint="j"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(mjcf(f"<worldbody>{BALL}</worldbody>{servos}"))
+    assert model.nu > model.nactuator
+    assert models.names_of(model, "actuator") == ("servo", "motor")
 
 
 @pytest.mark.parametrize(

@@ -143,6 +143,25 @@ def test_limbs_of_one_robot_do_not_collide(name, seed):
         assert floor in contact.geom or any(geom.startswith("scarf_") for geom in pair), pair
 
 
+def test_scarf_of_the_puppet_is_passive_and_lies_on_its_back():
+    spec = models.load_spec("puppet")
+    spec.delete(spec.joint("root"))
+    spec.body("pelvis").pos[2] = 3
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    scarf = [j for j, name in enumerate(models.joint_names(model)) if name.startswith("scarf_")]
+    assert len(scarf) == 6 and (model.jnt_type[scarf] == mujoco.mjtJoint.mjJNT_BALL).all()
+    assert not set(scarf) & set(model.actuator_trnid[:, 0])
+    damping = [model.dof_damping[model.jnt_dofadr[j]] for j in scarf]
+    assert min(damping) > 0 and max(damping) < 0.01
+    # Gravity turned forwards presses it on the coat: it must come to rest there, not inside.
+    model.opt.gravity[:] = 9.81 * np.sin(0.4), 0, -9.81 * np.cos(0.4)
+    run(model, data, 2.0)
+    assert data.ncon > 0
+    assert min(contact.dist for contact in data.contact) > -5e-3
+    assert np.abs(data.qvel).max() < 0.5
+
+
 def mirrored_state(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Equal angles with left and right exchanged; balls and the base reflected in the plane y = 0."""
     out = qpos.copy()
