@@ -10,6 +10,7 @@ from .graph import (
     ATAN2,
     CONST,
     COS,
+    HOLD,
     INPUT,
     INV,
     LESS,
@@ -17,6 +18,7 @@ from .graph import (
     MIN,
     MUL,
     NEG,
+    ROUND,
     SIN,
     SQRT,
     SUB,
@@ -32,7 +34,7 @@ from .graph import (
 def partials(node: Node) -> tuple[tuple[Node, Scalar], ...]:
     """Operands of `node` with the derivative of `node` by each."""
     op, a, b = node.op, node.a, node.b
-    if op in (CONST, INPUT, LESS):
+    if op in (CONST, INPUT, LESS, HOLD, ROUND):
         return ()
     assert a is not None
     if op == NEG:

@@ -12,8 +12,8 @@ import math
 from collections.abc import Iterable
 from typing import Any, TypeAlias
 
-CONST, INPUT, ADD, SUB, MUL, NEG, INV, SQRT, SIN, COS, MIN, MAX, ABS, LESS, ATAN2 = range(15)
-OP_NAMES = "const input add sub mul neg inv sqrt sin cos min max abs less atan2".split()
+CONST, INPUT, ADD, SUB, MUL, NEG, INV, SQRT, SIN, COS, MIN, MAX, ABS, LESS, ATAN2, HOLD, ROUND = range(17)
+OP_NAMES = "const input add sub mul neg inv sqrt sin cos min max abs less atan2 hold round".split()
 BINARY = frozenset((ADD, SUB, MUL, MIN, MAX, LESS, ATAN2))
 _COMMUTATIVE = frozenset((ADD, MUL, MIN, MAX))
 
@@ -55,7 +55,7 @@ class Node:
         if other == 1.0:
             return self
         if other < 0.0:
-            return self.graph.neg(self * -other)
+            return -(self * -other)
         return self.graph.mul(self, self.graph.const(other))
 
     __rmul__ = __mul__
@@ -170,13 +170,19 @@ class Graph:
             return a.a
         return 1.0 / a.value if a.op == CONST else self._new(INV, a)
 
+    def hold(self, a: Scalar) -> Scalar:
+        """`a` as a value that derivatives do not look behind."""
+        return self._new(HOLD, a) if isinstance(a, Node) else a
+
     def unary(self, op: int, a: Node) -> Scalar:
-        """Square root, sine, cosine or absolute value."""
+        """Square root, sine, cosine, absolute value or nearest integer."""
         if a.op == NEG:
             if op == SIN:
                 return self.neg(self._new(SIN, a.a))
             if op in (COS, ABS):
                 a = a.a
+            if op == ROUND:
+                return self.neg(self._new(ROUND, a.a))
         return self._new(op, a)
 
     def binary(self, op: int, a: Scalar, b: Scalar) -> Node:
@@ -202,6 +208,11 @@ def cos(x: Scalar) -> Scalar:
 def absolute(x: Scalar) -> Scalar:
     """Absolute value."""
     return x.graph.unary(ABS, x) if isinstance(x, Node) else abs(x)
+
+
+def nearest(x: Scalar) -> Scalar:
+    """Nearest integer (ties to even); its derivative is taken as zero."""
+    return x.graph.unary(ROUND, x) if isinstance(x, Node) else float(round(x))
 
 
 def _owner(*xs: Scalar) -> Graph | None:

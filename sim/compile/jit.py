@@ -54,18 +54,24 @@ def target_machine(level: int) -> Any:
     )
 
 
-def compile_ir(text: str, *, level: int = 2, passes: bool = True) -> bytes:
-    """Object code of a module; `passes` runs the optimizer before code generation."""
+def compile_ir(kernels: str, loops: str, *, inline: bool) -> bytes:
+    """Object code of straight-line `kernels` and the `loops` that call them.
+
+    The optimizer runs over the loops, and over the kernels where they are small enough to `inline`: a long
+    tape has nothing left to optimize, so that it goes to code generation as it is.
+    """
     import llvmlite.binding as llvm
 
-    machine = target_machine(level)
-    module = llvm.parse_assembly(text)
-    if passes:
-        tuning = llvm.create_pipeline_tuning_options(speed_level=2)
-        tuning.slp_vectorization = False
-        tuning.loop_vectorization = False
-        builder = llvm.create_pass_builder(machine, tuning)
-        builder.getModulePassManager().run(module, builder)
+    module, body = llvm.parse_assembly(loops), llvm.parse_assembly(kernels)
+    if inline:
+        module.link_in(body)
+    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
+    tuning.slp_vectorization = tuning.loop_vectorization = False
+    machine = target_machine(2 if inline else 1)
+    builder = llvm.create_pass_builder(machine, tuning)
+    builder.getModulePassManager().run(module, builder)
+    if not inline:
+        module.link_in(body)
     code: bytes = machine.emit_object(module)
     return code
 

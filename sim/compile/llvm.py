@@ -7,10 +7,10 @@ all lanes are computed at once; products and sums may contract into fused operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, SIN, SQRT, SUB
+from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, ROUND, SIN, SQRT, SUB
 from .tape import Tape
 
 _SIN = (
@@ -218,44 +218,115 @@ class Emitter:
         return self.call("copysign", angle, y)
 
 
-DECLARED = ("sqrt", "fabs", "copysign", "minnum", "maxnum", "pow")
+DECLARED = {"sqrt": 1, "fabs": 1, "rint": 1, "copysign": 2}
 
 
 def declarations(lanes: int) -> str:
     """Intrinsics that kernels on `lanes` may call."""
     e = Emitter(lanes)
-    arity = {"sqrt": 1, "fabs": 1}
     return "\n".join(
-        f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity.get(name, 2))})" for name in DECLARED
+        f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity)})" for name, arity in DECLARED.items()
     )
 
 
 _BINARY = {ADD: "fadd", SUB: "fsub", MUL: "fmul"}
 
 
-def kernel(name: str, tape: Tape, lanes: int, attributes: str = "") -> str:
-    """IR of `tape` as `void name(ptr inputs..., ptr outputs...)`; scalar k of an argument fills lanes k."""
-    e = Emitter(lanes)
-    values: list[str] = []
-    pairs: dict[int, tuple[str, str]] = {}
-    for op, a, b in tape.rows:
-        if op == CONST:
-            values.append(e.const(a))
-        elif op == INPUT:
-            values.append(e.load(f"%in{a}", b))
-        elif op in (SIN, COS):
-            if a not in pairs:
-                pairs[a] = e.sincos(values[a])
-            values.append(pairs[a][op == COS])
-        else:
-            values.append(_operation(e, op, values[a], None if b is None else values[b]))
-    for k, rows in enumerate(tape.results):
-        for j, row in enumerate(rows):
-            e.store(values[row], f"%out{k}", j)
-    arguments = [f"ptr noalias nocapture readonly align {e.align} %in{k}" for k in range(len(tape.inputs))]
-    arguments += [f"ptr noalias nocapture align {e.align} %out{k}" for k in range(len(tape.outputs))]
+CHUNK = 3000  # rows of a tape in one function: compile time grows faster than length
+
+
+def kernel(name: str, tape: Tape, lanes: int) -> str:
+    """IR of `tape` as `void name(ptr inputs..., ptr outputs...)`; scalar k of an argument fills lanes k.
+
+    A long tape is cut into functions that hand values on through memory.
+    """
+    arguments = [f"ptr noalias nocapture readonly %in{k}" for k in range(len(tape.inputs))]
+    arguments += [f"ptr noalias nocapture %out{k}" for k in range(len(tape.outputs))]
+    if len(tape.rows) <= CHUNK * 4 // 3:
+        e = Emitter(lanes)
+        _write(e, tape, range(len(tape.rows)), {})
+        return _function(name, arguments, e)
+    chunk_of = _chunks(tape)
+    slots, count = _slots(tape, chunk_of)
+    members: list[list[int]] = [[] for _ in range(max(chunk_of) + 1)]
+    for i, k in enumerate(chunk_of):
+        members[k].append(i)
+    texts, outer = [], Emitter(lanes)
+    work = outer.emit(f"alloca [{max(count, 1)} x {outer.V}], align 64")
+    passed = ", ".join("ptr " + argument.split()[-1] for argument in arguments)
+    for k, rows in enumerate(members):
+        e = Emitter(lanes)
+        _write(e, tape, rows, slots)
+        texts.append(_function(f"{name}.{k}", [*arguments, "ptr noalias nocapture %work"], e))
+        outer.do(f"call void @{name}.{k}({passed}, ptr {work})")
+    return "".join([*texts, _function(name, arguments, outer)])
+
+
+def _function(name: str, arguments: list[str], e: Emitter) -> str:
     body = "\n".join(e.lines)
-    return f"define internal void @{name}({', '.join(arguments)}) nounwind {attributes} {{\n{body}\n  ret void\n}}\n"
+    return f"define void @{name}({', '.join(arguments)}) nounwind {{\n{body}\n  ret void\n}}\n"
+
+
+def _chunks(tape: Tape) -> list[int]:
+    """Chunk of every row; both of a sine-cosine pair belong where the first one is."""
+    chunk_of = [i // CHUNK for i in range(len(tape.rows))]
+    pair: dict[int, int] = {}
+    for i, (op, a, _) in enumerate(tape.rows):
+        if op in (SIN, COS):
+            chunk_of[i] = pair.setdefault(a, chunk_of[i])
+    return chunk_of
+
+
+def _slots(tape: Tape, chunk_of: list[int]) -> tuple[dict[int, int], int]:
+    """Places in shared memory for the values that cross from chunk to chunk, and how many there are."""
+    last: dict[int, int] = {}
+    for i, (op, *operands) in enumerate(tape.rows):
+        for k in () if op in (CONST, INPUT) else operands:
+            if k is not None and tape.rows[k][0] not in (CONST, INPUT) and chunk_of[k] != chunk_of[i]:
+                last[k] = max(last.get(k, 0), chunk_of[i])
+    slots: dict[int, int] = {}
+    free: list[int] = []
+    ends: dict[int, list[int]] = {}
+    count = 0
+    for i in sorted(last, key=lambda i: (chunk_of[i], i)):
+        for chunk in [c for c in ends if c < chunk_of[i]]:
+            free += ends.pop(chunk)
+        if not free:
+            free.append(count)
+            count += 1
+        slots[i] = free.pop()
+        ends.setdefault(last[i], []).append(slots[i])
+    return slots, count
+
+
+def _write(e: Emitter, tape: Tape, rows: Iterable[int], slots: dict[int, int]) -> None:
+    """Instructions of some rows of a tape; values from other chunks come through their slots in %work."""
+    values: dict[int, str] = {}
+    pairs: dict[int, tuple[str, str]] = {}
+
+    def value(i: int) -> str:
+        if i not in values:
+            op, a, b = tape.rows[i]
+            if op == CONST:
+                values[i] = e.const(a)
+            elif op == INPUT:
+                values[i] = e.load(f"%in{a}", b)
+            else:
+                values[i] = e.load("%work", slots[i])
+        return values[i]
+
+    for i in rows:
+        op, a, b = tape.rows[i]
+        if op in (SIN, COS):
+            if a not in pairs:
+                pairs[a] = e.sincos(value(a))
+            values[i] = pairs[a][op == COS]
+        elif op not in (CONST, INPUT):
+            values[i] = _operation(e, op, value(a), None if b is None else value(b))
+        if i in slots:
+            e.store(values[i], "%work", slots[i])
+        for k, j in tape.targets.get(i, ()):
+            e.store(value(i), f"%out{k}", j)
 
 
 def _operation(e: Emitter, op: int, a: str, b: str | None) -> str:
@@ -268,8 +339,8 @@ def _operation(e: Emitter, op: int, a: str, b: str | None) -> str:
         return e.f("fdiv", e.const(1.0), a)
     if op == SQRT:
         return e.call("sqrt", a)
-    if op == ABS:
-        return e.call("fabs", a)
+    if op in (ABS, ROUND):
+        return e.call("fabs" if op == ABS else "rint", a)
     assert b is not None
     if op == LESS:
         return e.select(e.compare("olt", a, b), e.const(1.0), e.const(0.0))

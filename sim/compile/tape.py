@@ -16,6 +16,7 @@ from .graph import (
     ATAN2,
     CONST,
     COS,
+    HOLD,
     INPUT,
     INV,
     LESS,
@@ -24,6 +25,7 @@ from .graph import (
     MUL,
     NEG,
     OP_NAMES,
+    ROUND,
     SIN,
     SQRT,
     SUB,
@@ -45,6 +47,7 @@ _NUMPY = {
     MIN: np.minimum,
     MAX: np.maximum,
     ABS: np.abs,
+    ROUND: np.rint,
     ATAN2: np.arctan2,
 }
 
@@ -69,6 +72,9 @@ class Tape:
         rows: list[tuple[int, Any, Any]] = []
         place: dict[int, int] = {}
         for node in reachable([x for xs in outputs.values() for x in xs]):
+            if node.op == HOLD:
+                place[node.id] = place[node.a.id]
+                continue
             place[node.id] = len(rows)
             if node.op == CONST:
                 rows.append((CONST, node.value, None))
@@ -95,6 +101,15 @@ class Tape:
     def counts(self) -> dict[str, int]:
         """Number of operations of each kind."""
         return dict(Counter(OP_NAMES[op] for op, _, _ in self.rows if op not in _FREE))
+
+    @cached_property
+    def targets(self) -> dict[int, list[tuple[int, int]]]:
+        """Where each row is an output: (output, index)."""
+        out: dict[int, list[tuple[int, int]]] = {}
+        for k, rows in enumerate(self.results):
+            for j, row in enumerate(rows):
+                out.setdefault(row, []).append((k, j))
+        return out
 
     @cached_property
     def cost(self) -> int:

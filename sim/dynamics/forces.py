@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from ..compile.graph import Scalar, absolute, clip, maximum, minimum, sqrt
+from ..compile.graph import Scalar, absolute, clip, maximum, minimum, nearest, sqrt
+from . import spatial
 from .fields import Fields
 from .tree import BALL, FREE, HINGE, SLIDE
 
@@ -24,14 +25,23 @@ def disabled(model: mujoco.MjModel, flag: str) -> bool:
     return bool(model.opt.disableflags & getattr(_DISABLE, f"mjDSBL_{flag}"))
 
 
-def odd_polynomial(coefficients: Sequence[Scalar], x: Scalar) -> Scalar:
-    """x (c0 + c1 |x| + c2 x^2 + ...): MuJoCo's springs and dampers of higher order."""
+def damper(coefficients: Sequence[Scalar], rate: Scalar) -> Scalar:
+    """rate (c0 + c1 |rate| + c2 rate^2 + ...): MuJoCo's dampers of higher order are odd."""
     total: Scalar = 0.0
-    for k, c in enumerate(coefficients):
-        power: Scalar = x
-        for _ in range(k):
-            power = power * absolute(x)
+    power: Scalar = rate
+    for c in coefficients:
         total = total + c * power
+        power = power * absolute(rate)
+    return total
+
+
+def spring(coefficients: Sequence[Scalar], stretch: Scalar) -> Scalar:
+    """stretch (c0 + c1 stretch + c2 stretch^2 + ...): MuJoCo's springs of higher order need not be odd."""
+    total: Scalar = 0.0
+    power: Scalar = stretch
+    for c in coefficients:
+        total = total + c * power
+        power = power * stretch
     return total
 
 
@@ -45,10 +55,12 @@ def passive_forces(
         if model.jnt_type[joint] in (HINGE, SLIDE) and not disabled(model, "SPRING"):
             qadr, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             stretch = q[qadr] - fields.scalar("qpos_spring", qadr)
-            out[dof] = out[dof] - odd_polynomial(fields.polynomial("jnt_stiffness", joint), stretch)
+            out[dof] = out[dof] - spring(fields.polynomial("jnt_stiffness", joint), stretch)
+        elif not disabled(model, "SPRING"):
+            _spring_of_rotation(fields, joint, q, out)
     for dof in range(model.nv):
         if not disabled(model, "DAMPER"):
-            out[dof] = out[dof] - odd_polynomial(fields.polynomial("dof_damping", dof), v[dof])
+            out[dof] = out[dof] - damper(fields.polynomial("dof_damping", dof), v[dof])
         friction = fields.scalar("dof_frictionloss", dof)
         if friction_width is not None and (hasattr(friction, "op") or friction != 0.0):
             speed = sqrt(v[dof] * v[dof] + friction_width**2)
@@ -56,6 +68,38 @@ def passive_forces(
     for tendon in range(model.ntendon):
         _tendon_forces(fields, tendon, q, v, out)
     return out
+
+
+def _stretches(fields: Fields, joint: int, q: Sequence[Scalar]) -> list[Scalar]:
+    """How far a ball or free joint is from its spring's rest: p - p_rest (free), then log(q_rest^-1 q)."""
+    model = fields.model
+    at, out = int(model.jnt_qposadr[joint]), []
+    if model.jnt_type[joint] == FREE:
+        out = [q[at + k] - fields.scalar("qpos_spring", at + k) for k in range(3)]
+        at += 3
+    rest = [float(x) for x in model.qpos_spring[at : at + 4]]
+    conjugate = [rest[0], -rest[1], -rest[2], -rest[3]]
+    return out + spatial.rotation_vector(spatial.quaternion_product(conjugate, q[at : at + 4]))
+
+
+def _stiff(stiffness: Scalar) -> bool:
+    return hasattr(stiffness, "op") or stiffness != 0.0
+
+
+def _spring_of_rotation(fields: Fields, joint: int, q: Sequence[Scalar], out: list[Scalar]) -> None:
+    stiffness, dof = fields.scalar("jnt_stiffness", joint), int(fields.model.jnt_dofadr[joint])
+    if _stiff(stiffness):
+        for k, stretch in enumerate(_stretches(fields, joint, q)):
+            out[dof + k] = out[dof + k] - stiffness * stretch
+
+
+def rotation_spring_energy(fields: Fields, joint: int, q: Sequence[Scalar]) -> Scalar:
+    """Energy of the spring of a ball or free joint."""
+    stiffness = fields.scalar("jnt_stiffness", joint)
+    if not _stiff(stiffness):
+        return 0.0
+    stretch = _stretches(fields, joint, q)
+    return 0.5 * stiffness * spatial.dot(stretch, stretch)
 
 
 def tendon_coefficients(model: mujoco.MjModel, tendon: int) -> dict[int, float]:
@@ -96,9 +140,9 @@ def _tendon_forces(
         fields.polynomial("tendon_damping", tendon),
     )
     if stiffness and not disabled(model, "SPRING"):
-        force = force - odd_polynomial(stiffness, tendon_stretch(fields, tendon, q))
+        force = force - spring(stiffness, tendon_stretch(fields, tendon, q))
     if damping and not disabled(model, "DAMPER"):
-        force = force - odd_polynomial(damping, tendon_velocity(model, tendon, v))
+        force = force - damper(damping, tendon_velocity(model, tendon, v))
     for joint, coefficient in tendon_coefficients(model, tendon).items():
         dof = int(model.jnt_dofadr[joint])
         out[dof] = out[dof] + coefficient * force
@@ -122,7 +166,11 @@ def _transmission(
     size = {FREE: 6, BALL: 3}[kind]
     gears = fields.vector("actuator_gear", out, size)
     velocity: Scalar = sum((g * v[dof + k] for k, g in enumerate(gears)), 0.0)
-    return 0.0, velocity, {dof + k: g for k, g in enumerate(gears)}
+    length: Scalar = 0.0
+    if kind == BALL:
+        at = int(model.jnt_qposadr[target])
+        length = spatial.dot(gears, spatial.rotation_vector(q[at : at + 4]))
+    return length, velocity, {dof + k: g for k, g in enumerate(gears)}
 
 
 def active(model: mujoco.MjModel, actuator: int) -> bool:
@@ -157,6 +205,7 @@ def actuator_forces(
         force = gain * signal
         if model.actuator_biastype[actuator] == int(_BIAS.mjBIAS_AFFINE):
             force = force + _affine(fields, "actuator_biasprm", actuator, length, velocity)
+            force = force - gain * _whole_turns(model, actuator, signal - length)
         if model.actuator_forcelimited[actuator]:
             force = clip(force, *(float(x) for x in model.actuator_forcerange[actuator]))
         for dof, arm in moment.items():
@@ -166,6 +215,18 @@ def actuator_forces(
             dof = int(model.jnt_dofadr[joint])
             out[dof] = clip(out[dof], *(float(x) for x in model.jnt_actfrcrange[joint]))
     return out, rates
+
+
+def _whole_turns(model: mujoco.MjModel, actuator: int, error: Scalar) -> Scalar:
+    """What a position servo on a ball joint takes off its error so that it turns the shorter way."""
+    gain, bias = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_biasprm[actuator, 1])
+    on_ball = model.actuator_trntype[actuator] == int(_TRN.mjTRN_JOINT)
+    on_ball = on_ball and model.jnt_type[model.actuator_trnid[actuator, 0]] == BALL
+    servo = model.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_FIXED) and gain == -bias
+    if not (on_ball and servo and gain):
+        return 0.0
+    turn = 2.0 * np.pi * float(np.linalg.norm(model.actuator_gear[model.actuator_outadr[actuator], :3]))
+    return turn * nearest(error / turn) if turn else 0.0
 
 
 def _signal(

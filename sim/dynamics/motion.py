@@ -85,4 +85,4 @@ def _constant_turns(link: Link) -> tuple[Turn, ...]:
         return ()
     turns = [(2, link.phi), (0, link.alpha)]
     exact = [(axis, snap(cos(angle)), snap(sin(angle))) for axis, angle in turns]
-    return tuple(t for t in exact if t[1] != 1.0)
+    return tuple(t for t in exact if t[1] != 1.0 or t[2] != 0.0)

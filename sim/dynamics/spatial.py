@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..compile.graph import Scalar
+from ..compile.graph import Scalar, absolute, atan2, less, sqrt
 
 Vector = list[Scalar]
 Matrix = list[list[Scalar]]
@@ -87,6 +87,14 @@ def quaternion_product(a: Sequence[Scalar], b: Sequence[Scalar]) -> list[Scalar]
 def quaternion_rate(q: Sequence[Scalar], w: Sequence[Scalar]) -> list[Scalar]:
     """Time derivative of a quaternion for the angular velocity `w` in the turned frame: q (0, w) / 2."""
     return quaternion_product(q, [0.0, *scale(0.5, w)])
+
+
+def rotation_vector(q: Sequence[Scalar]) -> Vector:
+    """Axis times angle (at most pi) of the quaternion `q` (wxyz) of any length."""
+    w, u = q[0], list(q[1:])
+    length = sqrt(dot(u, u) + 1e-200)  # never zero: the ratio below stays exact
+    half = atan2(length, absolute(w)) / length
+    return scale(2.0 * half * (1.0 - 2.0 * less(w, 0.0)), u)
 
 
 def turn(t: Turn, v: Sequence[Scalar]) -> Vector:

@@ -66,8 +66,8 @@ def _joint(model: mujoco.MjModel, joint: int, keyed: Collection[int]) -> list[st
     kind, dof = model.jnt_type[joint], int(model.jnt_dofadr[joint])
     found = []
     if kind in (FREE, BALL) and joint not in keyed:
-        if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            found.append("a spring on a ball or free joint")
+        if model.jnt_stiffnesspoly[joint].any():
+            found.append("a nonlinear spring on a ball or free joint")
         if kind == FREE and np.ptp(model.dof_armature[dof : dof + 3]) != 0.0:
             found.append("armature that differs between the axes of a free joint")
     if model.jnt_actgravcomp[joint] and model.jnt_actfrclimited[joint]:
@@ -96,14 +96,6 @@ def _actuator(model: mujoco.MjModel, actuator: int) -> list[str]:
     transmission = model.actuator_trntype[actuator]
     if transmission not in (int(_TRN.mjTRN_JOINT), int(_TRN.mjTRN_TENDON)):
         found.append(f"transmission {_TRN(int(transmission)).name.removeprefix('mjTRN_').lower()}")
-    elif transmission == int(_TRN.mjTRN_JOINT) and model.jnt_type[model.actuator_trnid[actuator, 0]] == BALL:
-        uses_length = model.actuator_gaintype[actuator] == int(_GAIN.mjGAIN_AFFINE)
-        uses_length = uses_length and bool(model.actuator_gainprm[actuator, 1])
-        if uses_length or (
-            model.actuator_biastype[actuator] == int(_BIAS.mjBIAS_AFFINE)
-            and model.actuator_biasprm[actuator, 1]
-        ):
-            found.append("a length-dependent force on a ball joint")
     dynamics = model.actuator_dyntype[actuator]
     if dynamics not in (
         int(_DYN.mjDYN_NONE),

@@ -22,16 +22,16 @@ FREE, BALL, SLIDE, HINGE = (
 )
 DOFS = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 COORDINATES = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
-_SNAP = 1e-13
+_SNAP = 1e-14
 
 
-def snap(x: Scalar, unit: float = 1.0) -> Scalar:
-    """`x` without the rounding that would spoil an exact 0, 1 or -1 (times `unit` for 0)."""
+def snap(x: Scalar) -> Scalar:
+    """`x` without the rounding that would spoil an exact 0, 1 or -1."""
     if isinstance(x, Node):
         return x
-    if abs(x) < _SNAP * unit:
+    if abs(x) < _SNAP:
         return 0.0
-    return round(x) if abs(abs(x) - 1.0) < _SNAP else float(x)
+    return float(round(x)) if abs(abs(x) - 1.0) < _SNAP else float(x)
 
 
 @dataclass
@@ -83,10 +83,12 @@ class Inertia:
             [[x + y for x, y in zip(a, b, strict=True)] for a, b in zip(self.J, other.J, strict=True)],
         )
 
-    def snapped(self, mass: float, length: float) -> Inertia:
-        """Without entries that are rounding of zero at the scale of the whole tree."""
-        J = [[_tiny(x, mass * length * length) for x in row] for row in self.J]
-        return Inertia(self.m, [_tiny(x, mass * length) for x in self.h], J)
+    def snapped(self, like: Inertia) -> Inertia:
+        """Without entries that are rounding of zero beside the matter `like`."""
+        moments = [_size(like.J[k][k]) for k in range(3)]
+        lever = max([_size(x) for x in like.h] + [(_size(like.m) * max(moments)) ** 0.5])
+        J = [[_tiny(x, max(moments)) for x in row] for row in self.J]
+        return Inertia(self.m, [_tiny(x, lever) for x in self.h], J)
 
     def rotational(self) -> Matrix:
         """Moments of inertia about the origin: tr(J) 1 - J."""
@@ -98,8 +100,12 @@ class Inertia:
         ]
 
 
+def _size(x: Scalar) -> float:
+    return 0.0 if isinstance(x, Node) else abs(x)
+
+
 def _tiny(x: Scalar, unit: float) -> Scalar:
-    return x if isinstance(x, Node) or abs(x) > _SNAP * unit else 0.0
+    return x if isinstance(x, Node) or abs(x) > 1e-15 * unit else 0.0
 
 
 @dataclass
@@ -196,13 +202,12 @@ def build_tree(fields: Fields) -> Tree:
         if body_link[body] >= 0:
             links[body_link[body]].bodies[body] = body_pose[body]
     _choose_frames(links)
-    length = max(float(model.stat.extent), 1e-6)
     for link in links:
         for body, pose in link.bodies.items():
             body_pose[body] = pose
             link.inertia = link.inertia + _body_inertia(fields, body).moved(pose)
-        link.inertia = link.inertia.snapped(float(model.body_mass.sum()), length)
-    _regroup(links, float(model.body_mass.sum()), length)
+        link.inertia = link.inertia.snapped(link.inertia)
+    _regroup(links)
     return Tree(links, body_link, body_pose)
 
 
@@ -269,13 +274,18 @@ def _choose_frames(links: list[Link]) -> None:
     for index, link in enumerate(links):
         base = moves[link.parent].inverse() if link.parent >= 0 else Pose(np.eye(3), zeros())
         link.X = base @ link.X @ moves[index]
-        link.X.p = [snap(x) for x in link.X.p]
+        link.X.p = _snapped(link.X.p)
         link.axis = [snap(x) for x in Pose(base.R, zeros()).apply(link.axis)]
         link.bodies = {body: moves[index].inverse() @ pose for body, pose in link.bodies.items()}
         if link.kind == HINGE:
             link.phi, link.alpha = _zx(link.X.R)
             rest = (_rz(link.phi) @ _rx(link.alpha)).T @ link.X.R
             link.offset += atan2(rest[1, 0], rest[0, 0])
+
+
+def _snapped(p: Vector) -> Vector:
+    unit = max(_size(x) for x in p)
+    return [_tiny(x, unit) for x in p]
 
 
 def _common_normal(link: Link) -> float:
@@ -304,7 +314,7 @@ def _shift(link: Link, phi: float, links: list[Link]) -> Scalar:
     return p[2] * (-float(np.sign(axis[2]))) if sine < 1e-13 else 0.0
 
 
-def _regroup(links: list[Link], mass: float, length: float) -> None:
+def _regroup(links: list[Link]) -> None:
     """Hand matter whose place does not depend on a joint's position to the parent: exact, and it leaves zeros.
 
     What lies on a hinge's axis (all of m, h_z and J_zz), the second moment behind a slide, the mass at a
@@ -325,7 +335,8 @@ def _regroup(links: list[Link], mass: float, length: float) -> None:
             given, kept = Inertia(own.m), Inertia(0.0, own.h, own.J)
         else:
             continue
-        link.regrouped = kept.snapped(mass, length)
+        link.regrouped = kept.snapped(own)
         if link.parent >= 0:
             parent = links[link.parent]
-            parent.regrouped = (parent.regrouped + given.moved(link.X)).snapped(mass, length)
+            whole = parent.regrouped + given.moved(link.X)
+            parent.regrouped = whole.snapped(whole)

@@ -1,0 +1,170 @@
+"""A compiled function over batches of states: found on disk or built, called through bound pointers."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cache import Cache
+from .jit import Loaded, compile_ir, load
+from .llvm import declarations, kernel
+from .loops import declare, map_function
+from .tape import Tape
+
+Array = NDArray[np.float64]
+
+INLINE_COST = 200  # operations up to which a kernel is inlined into its loops
+
+
+@dataclass(frozen=True)
+class Build:
+    """How one program came to be: seconds of its parts, or that it was found on disk."""
+
+    name: str
+    lanes: int
+    cached: bool
+    operations: int
+    symbolic_s: float
+    compile_s: float
+    load_s: float
+
+
+@dataclass(frozen=True)
+class Code:
+    """Machine code with the facts that were stored beside it."""
+
+    loaded: Loaded
+    facts: dict[str, Any]
+    build: Build
+
+
+def obtain(
+    name: str, lanes: int, cache: Cache, key: str, make: Callable[[], tuple[str, str, dict[str, Any]]]
+) -> Code:
+    """The code of `key` from disk, or by `make`, which gives kernels, loops (IR) and facts to keep.
+
+    `facts` needs "operations" and "cost".
+    """
+    entry = cache.get(key)
+    begin = time.perf_counter()
+    if entry is not None:
+        facts = json.loads(entry["facts"])
+        loaded = load(entry["object"])
+        seconds = time.perf_counter() - begin
+        return Code(loaded, facts, Build(name, lanes, True, facts["operations"], 0.0, 0.0, seconds))
+    kernels, loops, facts = make()
+    built = time.perf_counter()
+    code = compile_ir(kernels, loops, inline=facts["cost"] <= INLINE_COST)
+    compiled = time.perf_counter()
+    cache.put(key, {"facts": json.dumps(facts).encode(), "object": code})
+    loaded = load(code)
+    done = time.perf_counter()
+    build = Build(name, lanes, False, facts["operations"], built - begin, compiled - built, done - compiled)
+    return Code(loaded, facts, build)
+
+
+def facts_of(tape: Tape) -> dict[str, Any]:
+    """What a program needs to know about its tape after the tape is gone."""
+    return {
+        "inputs": tape.inputs,
+        "outputs": tape.outputs,
+        "operations": sum(tape.counts.values()),
+        "counts": tape.counts,
+        "cost": tape.cost,
+    }
+
+
+def map_source(tape: Tape, lanes: int) -> tuple[str, str, dict[str, Any]]:
+    """Kernel, loop and facts of a function over batches."""
+    head = declarations(lanes) + "\n"
+    loops = head + declare("f", tape) + map_function("map", "f", tape, lanes)
+    return head + kernel("f", tape, lanes), loops, facts_of(tape)
+
+
+@cache
+def workers() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=workers(), thread_name_prefix="pantograph")
+
+
+def in_parallel(call: Callable[[int, int], None], count: int, lanes: int, threads: int) -> None:
+    """call(first, size) over `count` states, in `threads` blocks of whole lanes side by side."""
+    blocks = -(-count // lanes)
+    threads = min(threads, blocks)
+    if threads <= 1:
+        call(0, count)
+        return
+    edges = [min(count, (blocks * k // threads) * lanes) for k in range(threads)] + [count]
+    jobs = [_pool().submit(call, a, b - a) for a, b in zip(edges[1:-1], edges[2:], strict=True)]
+    call(edges[0], edges[1])
+    for job in jobs:
+        job.result()
+
+
+def address(array: Array) -> int:
+    """Address of an array's data."""
+    place: int = array.__array_interface__["data"][0]
+    return place
+
+
+class Program:
+    """A function of named arrays, over a batch along the leading axis."""
+
+    def __init__(self, code: Code, lanes: int):
+        self.code, self.lanes, self.build = code, lanes, code.build
+        self.inputs: dict[str, int] = code.facts["inputs"]
+        self.outputs: dict[str, int] = code.facts["outputs"]
+        kinds = [ctypes.c_int64] + [ctypes.c_void_p, ctypes.c_int64] * len(self.inputs)
+        self.function = code.loaded.function("map", *kinds, *[ctypes.c_void_p] * len(self.outputs))
+
+    def __call__(self, arrays: Sequence[Array], count: int, threads: int) -> list[Array]:
+        """Outputs, shape (count, size) each; `arrays` are contiguous, (count, size) or (size,)."""
+        strides = [size if x.ndim == 2 else 0 for x, size in zip(arrays, self.inputs.values(), strict=True)]
+        outs = [np.empty((count, size)) for size in self.outputs.values()]
+        places = [address(x) for x in arrays]
+        targets = [address(x) for x in outs]
+        sizes = list(self.outputs.values())
+
+        def run(first: int, size: int) -> None:
+            ins = [x for p, s in zip(places, strides, strict=True) for x in (p + 8 * first * s, s)]
+            self.function(size, *ins, *(p + 8 * first * s for p, s in zip(targets, sizes, strict=True)))
+
+        if count:
+            in_parallel(run, count, self.lanes, threads)
+        return outs
+
+
+class Bound:
+    """A program on fixed arrays for one state: write the inputs, call, read the outputs; costs no more than
+    the call itself.
+
+    `inputs` and `outputs` are the arrays by name.
+    """
+
+    def __init__(self, program: Program):
+        self.inputs = {name: np.zeros(size) for name, size in program.inputs.items()}
+        self.outputs = {name: np.zeros(size) for name, size in program.outputs.items()}
+        arguments = [x for array in self.inputs.values() for x in (address(array), 0)]
+        arguments += [address(array) for array in self.outputs.values()]
+        function, fixed = program.function, tuple(arguments)
+        self._keep = program
+        self._call = lambda: function(1, *fixed)
+
+    def __call__(self) -> None:
+        """Compute the outputs from the inputs."""
+        self._call()

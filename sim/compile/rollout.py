@@ -1,0 +1,180 @@
+"""Whole integrations as compiled loops: explicit Runge-Kutta methods with fixed steps, controls held.
+
+The state x lives in lanes; `rate` is the kernel (x, u, w, p) -> dx/dt. Quaternions follow their own ODE and
+are scaled back to unit length after every step, which keeps the order of the method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .llvm import Emitter
+from .loops import Block, buffer, function, shifted
+
+Array = NDArray[np.float64]
+
+
+class Method(Protocol):
+    """What is needed of a tableau (see `sim.integrate.tableau.Tableau`)."""
+
+    @property
+    def A(self) -> Array: ...  # noqa: D102
+
+    @property
+    def b(self) -> Array: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Sizes of what a compiled integration handles.
+
+    `quaternions` are first entries in x; `nr`, `ng` the sizes of a controller's reference rows and gains
+    (None: the control rows are used as they come).
+    """
+
+    nx: int
+    nu: int
+    nw: int
+    np: int
+    quaternions: tuple[int, ...]
+    nr: int | None = None
+    ng: int = 0
+
+
+def combine(e: Emitter, out: str, x: str, h: str, terms: list[tuple[float, str]], size: int) -> None:
+    """out = x + h sum_j weight_j k_j, over `size` scalars."""
+    with e.loop(size) as i:
+        total = ""
+        for weight, k in terms:
+            value = e.load(k, i)
+            part = e.f("fmul", value, e.const(weight))
+            total = part if not total else e.f("fadd", total, part)
+        start = e.load(x, i)
+        e.store(e.f("fadd", start, e.f("fmul", total, h)) if total else start, out, i)
+
+
+def normalize(e: Emitter, x: str, quaternions: tuple[int, ...]) -> None:
+    """Unit length for the quaternions in `x`."""
+    for first in quaternions:
+        parts = [e.load(x, first + k) for k in range(4)]
+        square = e.f("fmul", parts[0], parts[0])
+        for part in parts[1:]:
+            square = e.f("fadd", square, e.f("fmul", part, part))
+        scale = e.f("fdiv", e.const(1.0), e.call("sqrt", square))
+        for k, part in enumerate(parts):
+            e.store(e.f("fmul", part, scale), x, first + k)
+
+
+def splat(e: Emitter, scalar: str) -> str:
+    """A scalar register in all lanes."""
+    if e.lanes == 1:
+        return scalar
+    one = e.emit(f"insertelement {e.V} poison, double {scalar}, i64 0")
+    zeros = f"<{e.lanes} x i32> zeroinitializer"
+    return e.emit(f"shufflevector {e.V} {one}, {e.V} poison, {zeros}")
+
+
+def live_stages(A: Array, b: Array) -> list[int]:
+    """Stages that a step of fixed length needs."""
+    needed = {i for i in range(len(b)) if b[i] != 0.0}
+    for i in reversed(range(len(b))):
+        if i in needed:
+            needed |= {j for j in range(i) if A[i, j] != 0.0}
+    return sorted(needed)
+
+
+CONTROL_ARGUMENTS = ["ptr noalias %r", "i64 %r_state", "i64 %r_period", "ptr noalias %g", "i64 %g_state", "ptr noalias %applied"]
+
+
+class Control:
+    """Controls of a block: rows of an array, or a compiled law of the state, held over a period."""
+
+    def __init__(self, e: Emitter, shape: Shape, block: Block, U: str):
+        self.e, self.shape, self.block, self.U = e, shape, block, U
+        self.rows = block.pointers("%r", "%r_state")
+        self.R = buffer_outside(e, shape.nr or 0)
+        self.G = buffer_outside(e, shape.ng)
+        if shape.nr is not None:
+            block.gather(block.pointers("%g", "%g_state"), self.G, shape.ng)
+
+    def hold(self, period: str, X: str) -> None:
+        """Set the controls of `period` from the state at its start."""
+        e, shape = self.e, self.shape
+        offset = e.emit(f"mul nsw i64 {period}, %r_period")
+        rows = shifted(e, self.rows, offset)
+        if shape.nr is None:
+            self.block.gather(rows, self.U, shape.nu)
+            return
+        self.block.gather(rows, self.R, shape.nr)
+        e.do(f"call void @law(ptr {X}, ptr {self.R}, ptr {self.G}, ptr {self.U})")
+        per_state = e.emit(f"mul nsw i64 %periods, {shape.nu}")
+        out = self.block.pointers("%applied", per_state)
+        at = e.emit(f"mul nsw i64 {period}, {shape.nu}")
+        self.block.scatter(self.U, shifted(e, out, at), shape.nu)
+
+
+def buffer_outside(e: Emitter, size: int) -> str:
+    """A buffer allocated at the function's entry although asked for inside a loop."""
+    register = e.fresh()
+    e.lines.insert(0, f"  {register} = alloca [{max(size, 1)} x {e.V}], align 64")
+    return register
+
+
+def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
+    """Integration in fixed steps, as IR.
+
+    `void name(i64 n, i64 periods, i64 steps, i64 every, double h, x0, controls..., w, w_state, p, p_state,
+    path)`: `periods` control periods of `steps` steps; every `every` steps the state is recorded, the
+    initial one included. `w` has a row for each stage of each step.
+    """
+    e = Emitter(lanes)
+    X, Y, U, W, P = (buffer(e, size) for size in (shape.nx, shape.nx, shape.nu, shape.nw, shape.np))
+    used = live_stages(method.A, method.b)
+    K = {i: buffer(e, shape.nx) for i in used}
+    h = splat(e, "%h")
+    stages = len(method.b)
+    total = e.emit("mul nsw i64 %periods, %steps")
+    quotient = e.emit(f"sdiv i64 {total}, %every")
+    records = e.emit(f"add nsw i64 {quotient}, 1")
+    per_state = e.emit(f"mul nsw i64 {records}, {shape.nx}")
+    with e.loop("%n", lanes) as first:
+        block = Block(e, first, "%n")
+        control = Control(e, shape, block, U)
+        block.gather(block.pointers("%x0", shape.nx), X, shape.nx)
+        block.gather(block.pointers("%p", "%p_state"), P, shape.np)
+        w_rows = block.pointers("%w", "%w_state")
+        path = block.pointers("%path", per_state)
+        block.scatter(X, path, shape.nx)
+        with e.loop("%periods") as period:
+            control.hold(period, X)
+            with e.loop("%steps") as step:
+                done = e.emit(f"mul nsw i64 {period}, %steps")
+                number = e.emit(f"add nsw i64 {done}, {step}")
+                for i in used:
+                    terms = [(float(method.A[i, j]), K[j]) for j in used if j < i and method.A[i, j] != 0.0]
+                    at = X
+                    if terms:
+                        combine(e, Y, X, h, terms, shape.nx)
+                        at = Y
+                    if shape.nw:
+                        row = e.emit(f"mul nsw i64 {number}, {stages}")
+                        row = e.emit(f"add nsw i64 {row}, {i}")
+                        offset = e.emit(f"mul nsw i64 {row}, {shape.nw}")
+                        block.gather(shifted(e, w_rows, offset), W, shape.nw)
+                    e.do(f"call void @rate(ptr {at}, ptr {U}, ptr {W}, ptr {P}, ptr {K[i]})")
+                combine(e, X, X, h, [(float(method.b[i]), K[i]) for i in used if method.b[i]], shape.nx)
+                normalize(e, X, shape.quaternions)
+                reached = e.emit(f"add nsw i64 {number}, 1")
+                rest = e.emit(f"srem i64 {reached}, %every")
+                with e.when(e.emit(f"icmp eq i64 {rest}, 0")):
+                    record = e.emit(f"sdiv i64 {reached}, %every")
+                    offset = e.emit(f"mul nsw i64 {record}, {shape.nx}")
+                    block.scatter(X, shifted(e, path, offset), shape.nx)
+    arguments = ["i64 %n", "i64 %periods", "i64 %steps", "i64 %every", "double %h", "ptr noalias %x0"]
+    arguments += CONTROL_ARGUMENTS
+    arguments += ["ptr noalias %w", "i64 %w_state", "ptr noalias %p", "i64 %p_state", "ptr noalias %path"]
+    return function(name, arguments, e)

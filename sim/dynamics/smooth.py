@@ -1,0 +1,357 @@
+"""The smooth engine: a model's equations of motion as machine code.
+
+    smooth = compile_model(model)
+    a = smooth.forward(q, v, u)                       # one state or a batch
+    path = smooth.rollout(q0, v0, u, step=1e-3, steps=1000)
+
+Nothing is compiled before it is asked for; what was compiled once is found on disk the next time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..compile import jit
+from ..compile.cache import Cache, default_folder, key_of
+from ..compile.program import Bound, Build, Code, Program, map_source, obtain, workers
+from ..errors import EngineError
+from .fields import Parameter, parameter_index
+from .functions import FUNCTIONS, cheaper_formulation
+from .layout import Keyed, Layout, keyed_joints
+from .support import differences, unsupported
+from .symbolic import Equations
+
+Array = NDArray[np.float64]
+
+_MODEL_PREFIXES = ("body_", "jnt_", "dof_", "actuator_", "tendon_", "wrap_", "qpos", "eq_", "site_", "geom_fluid")
+_PARALLEL_OPERATIONS = 400_000  # work below which one thread is quicker
+
+
+def model_fingerprint(model: mujoco.MjModel) -> bytes:
+    """Everything of a model that its smooth dynamics can depend on, as bytes."""
+    parts = []
+    for name in dir(model):
+        if name.startswith(_MODEL_PREFIXES):
+            value = getattr(model, name)
+            if isinstance(value, np.ndarray):
+                parts.append(name.encode() + str(value.shape).encode() + np.ascontiguousarray(value).tobytes())
+    option = model.opt
+    numbers = [*option.gravity, *option.wind, option.density, option.viscosity, model.stat.extent]
+    flags = [option.disableflags, option.disableactuator, option.enableflags]
+    return b"\0".join(parts) + np.asarray(numbers).tobytes() + np.asarray(flags, np.int64).tobytes()
+
+
+def _code_fingerprint() -> str:
+    """Hash of this engine's own source: another version never reads what this one compiled."""
+    here = Path(__file__).parent
+    files = sorted([*here.glob("*.py"), *(here.parent / "compile").glob("*.py")])
+    return key_of(*(file.read_bytes() for file in files))
+
+
+@dataclass(frozen=True)
+class Stats:
+    """What an engine has built so far.
+
+    Attributes:
+        formulation: of the forward dynamics: "composite" (inertia matrix and factor) or "articulated".
+        operations: scalar operations of one evaluation of the forward dynamics.
+        lanes: states computed side by side in batches.
+        builds: every program with seconds of its symbolic build, compilation and loading.
+    """
+
+    formulation: str
+    operations: int
+    lanes: int
+    builds: tuple[Build, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on all programs."""
+        return sum(b.symbolic_s + b.compile_s + b.load_s for b in self.builds)
+
+    @property
+    def cached(self) -> bool:
+        """Whether every program was found on disk."""
+        return bool(self.builds) and all(b.cached for b in self.builds)
+
+
+def compile_model(
+    model: mujoco.MjModel,
+    *,
+    keyed: Keyed = (),
+    parameters: Sequence[Parameter] = (),
+    friction_width: float | None = None,
+    lanes: int | None = None,
+    threads: int | None = None,
+    cache: Path | None | bool = True,
+) -> Smooth:
+    """The smooth engine for `model`.
+
+    `keyed` names the joints whose motion is prescribed (names, ids, or a bool mask over freedoms);
+    `parameters` model entries that become inputs `p`, as (field, name or row[, column]), e.g.
+    ("body_mass", "forearm"), ("body_pos", "hand", 2), ("actuator_gainprm", "elbow", 0); `friction_width`
+    [rad/s or m/s] smooths dry friction (None leaves it out); `lanes` fixes the states computed side by side
+    in a batch (default: what the processor is best at); `threads` limits those used for batches; `cache` is
+    the folder of compiled code (True: the user's, None or False: none).
+
+    Raises EngineError naming everything in the model that the engine cannot do.
+    """
+    joints = keyed_joints(model, keyed)
+    problems = unsupported(model, keyed=joints)
+    if problems:
+        raise EngineError("the smooth engine cannot do:\n  " + "\n  ".join(problems))
+    for parameter in parameters:
+        parameter_index(model, parameter)
+    if friction_width is not None and not friction_width > 0:
+        raise EngineError(f"friction_width must be positive, not {friction_width}")
+    folder = default_folder() if cache is True else (cache or None)
+    return Smooth(model, joints, tuple(parameters), friction_width, lanes, threads, Cache(folder))
+
+
+class Smooth:
+    """Compiled dynamics of one model; made by `compile_model`. Safe to use from several threads.
+
+    The state is q (nq), v (nv) and act (na) over the joints that are not keyed; `w` is the prescribed motion
+    (q, v, a) of the keyed ones, `u` the controls (nu), `p` the parameters. Every function takes one state
+    (1-D arrays) or a batch (2-D, leading axis); an argument given once (1-D) serves a whole batch.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        joints: tuple[int, ...],
+        parameters: tuple[Parameter, ...],
+        friction_width: float | None,
+        lanes: int | None,
+        threads: int | None,
+        cache: Cache,
+    ):
+        self.model = model
+        self.layout = Layout(model, joints)
+        self.parameters, self.friction_width = parameters, friction_width
+        self.lanes = lanes or jit.preferred_lanes()
+        self.threads = threads or workers()
+        self.differences = tuple(differences(model, friction_width=friction_width))
+        self.parameter_values = np.array(
+            [np.atleast_2d(getattr(model, f).T).T[r, c] for f, r, c in (parameter_index(model, p) for p in parameters)],
+            dtype=float,
+        )
+        self._cache = cache
+        self._programs: dict[tuple[str, int], Program] = {}
+        self._codes: dict[tuple[Any, ...], Code] = {}
+
+    @cached_property
+    def _key(self) -> str:
+        roles = repr((self.layout.keyed, self.parameters, self.friction_width))
+        versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
+        return key_of(model_fingerprint(self.model), roles, versions, _code_fingerprint())
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The symbolic model."""
+        return Equations(
+            self.model, self.layout, parameters=self.parameters, friction_width=self.friction_width
+        )
+
+    @cached_property
+    def formulation(self) -> str:
+        """The cheaper formulation of the forward dynamics."""
+        return cheaper_formulation(self.equations)
+
+    def tape(self, name: str) -> Any:
+        """The program of one of FUNCTIONS before compilation (`.casadi()` gives it to optimisers)."""
+        return FUNCTIONS[name](self.equations, self.formulation)
+
+    def program(self, name: str, lanes: int) -> Program:
+        """The compiled function `name` of FUNCTIONS in `lanes`."""
+        found = self._programs.get((name, lanes))
+        if found is None:
+
+            def make() -> tuple[str, str, dict[str, Any]]:
+                kernels, loops, facts = map_source(self.tape(name), lanes)
+                return kernels, loops, facts | {"formulation": self.formulation}
+
+            code = obtain(name, lanes, self._cache, key_of(self._key, "map", name, str(lanes)), make)
+            found = self._programs[name, lanes] = Program(code, lanes)
+        return found
+
+    def bind(self, name: str) -> Bound:
+        """Function `name` on its own arrays, for the quickest calls on one state."""
+        return Bound(self.program(name, 1))
+
+    @property
+    def stats(self) -> Stats:
+        """What was built so far."""
+        programs = [*self._programs.values()]
+        builds = tuple([p.build for p in programs] + [c.build for c in self._codes.values()])
+        facts = [p.code.facts for p in programs if p.build.name == "forward"]
+        facts = facts or [self.program("forward", 1).code.facts]
+        return Stats(facts[0]["formulation"], facts[0]["operations"], self.lanes, builds)
+
+    def _rows(self, name: str, value: ArrayLike | None, size: int) -> Array:
+        if value is None:
+            if name == "p":
+                return self.parameter_values
+            if name == "w" and size:
+                raise EngineError("keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints")
+            return np.zeros(size)
+        array = np.ascontiguousarray(value, dtype=np.float64)
+        if array.ndim not in (1, 2) or array.shape[-1] != size:
+            raise EngineError(f"{name} has shape {array.shape}; expected ({size},) or (batch, {size})")
+        return array
+
+    def evaluate(self, name: str, **arguments: ArrayLike | None) -> dict[str, Array]:
+        """Outputs of function `name` of FUNCTIONS by name, flat; a batch if any argument is one."""
+        sizes = {"q": self.layout.nq, "v": self.layout.nv, "act": self.layout.na, "u": self.layout.nu}
+        sizes |= {"tau": self.layout.nv, "a": self.layout.nv, "w": self.layout.nw, "p": len(self.parameters)}
+        sizes["bar"] = max(self.layout.nx, self.layout.nv)
+        rows = {key: self._rows(key, value, sizes[key]) for key, value in arguments.items()}
+        counts = {len(x) for x in rows.values() if x.ndim == 2}
+        if len(counts) > 1:
+            raise EngineError(f"batches of different lengths: {sorted(counts)}")
+        count = counts.pop() if counts else 1
+        single = all(x.ndim == 1 for x in rows.values())
+        program = self.program(name, 1 if count == 1 else self.lanes)
+        arrays = [rows[key] if key in rows else self._rows(key, None, sizes[key]) for key in program.inputs]
+        work = count * program.build.operations
+        outs = program(arrays, count, self.threads if work > _PARALLEL_OPERATIONS else 1)
+        return {
+            key: out[0] if single else out for key, out in zip(program.outputs, outs, strict=True)
+        }
+
+    def forward(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        act: ArrayLike | None = None,
+        tau: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> Array:
+        """Accelerations [rad/s^2, m/s^2] under controls `u` and additional generalized forces `tau`."""
+        return self.evaluate("forward", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)["a"]
+
+    def inverse(
+        self, q: ArrayLike, v: ArrayLike, a: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None
+    ) -> Array:
+        """Forces on all the model's freedoms, beside passive ones, that produce the acceleration `a`."""
+        return self.evaluate("inverse", q=q, v=v, a=a, w=w, p=p)["tau"]
+
+    def drive(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        act: ArrayLike | None = None,
+        tau: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> Array:
+        """Forces that the drives of the keyed freedoms give beside their actuators and passive forces."""
+        return self.evaluate("drive", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)["drive"]
+
+    def mass_matrix(self, q: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
+        """Inertia matrix, shape (..., nv, nv)."""
+        return _square(self.evaluate("mass_matrix", q=q, w=w, p=p)["M"], self.layout.nv)
+
+    def energy(
+        self, q: ArrayLike, v: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Kinetic and potential energy [J] (gravity, joint and tendon springs)."""
+        out = self.evaluate("energy", q=q, v=v, w=w, p=p)
+        return out["kinetic"][..., 0], out["potential"][..., 0]
+
+    def momentum(
+        self, q: ArrayLike, v: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Linear momentum [kg m/s] and angular momentum about the world's origin [kg m^2/s]."""
+        out = self.evaluate("momentum", q=q, v=v, w=w, p=p)
+        return out["linear"], out["angular"]
+
+    def poses(
+        self, q: ArrayLike, *, sites: bool = False, w: ArrayLike | None = None, p: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Positions (..., n, 3) [m] and rotation matrices (..., n, 3, 3) of all bodies, or of all sites."""
+        out = self.evaluate("sites" if sites else "poses", q=q, w=w, p=p)
+        lead = out["p"].shape[:-1]
+        return out["p"].reshape(*lead, -1, 3), out["R"].reshape(*lead, -1, 3, 3)
+
+    def derivatives(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        act: ArrayLike | None = None,
+        tau: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> Derivatives:
+        """Exact derivatives of `forward` by q (tangent space), v, tau."""
+        out = self.evaluate("derivatives", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)
+        n = self.layout.nv
+        return Derivatives(out["a"], _square(out["dq"], n), _square(out["dv"], n), _square(out["dtau"], n))
+
+    def control_derivatives(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        act: ArrayLike | None = None,
+        tau: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> dict[str, Array]:
+        """Exact derivatives of `forward` by "act", "u" and "p", shapes (..., nv, n)."""
+        out = self.evaluate("control_derivatives", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)
+        sizes = {"act": self.layout.na, "u": self.layout.nu, "p": len(self.parameters)}
+        n = self.layout.nv
+        return {key: out["d" + key].reshape(*out["d" + key].shape[:-1], n, m) for key, m in sizes.items()}
+
+    def vjp(
+        self,
+        bar: ArrayLike,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        act: ArrayLike | None = None,
+        tau: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> dict[str, Array]:
+        """bar^T times the derivatives of `forward` by "q" (tangent space), "v", "act", "u", "tau", "p"."""
+        wide = np.asarray(bar, dtype=float)
+        spare = max(self.layout.nx, self.layout.nv) - wide.shape[-1]
+        wide = np.concatenate([wide, np.zeros((*wide.shape[:-1], spare))], axis=-1)
+        return self.evaluate("vjp", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p, bar=wide)
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """Accelerations `a` and their derivatives by q (tangent space), v and tau, (..., nv, nv) each."""
+
+    a: Array
+    dq: Array
+    dv: Array
+    dtau: Array
+
+
+def _square(flat: Array, n: int) -> Array:
+    return flat.reshape(*flat.shape[:-1], n, n)
+
+
+_ = ctypes
