@@ -1,11 +1,11 @@
 """The servos of one bus in SI units, over the packet handler of the official SDK.
 
-Of dynamixel_sdk 4.1.0 the packet handler's txPacket and rxPacket are used, not its group classes, which give up a whole
-sync read for one missing servo, wait 35 ms for it, and drop every error byte. What else is guarded here:
+Of dynamixel_sdk 4.1.0 the packet handler's txPacket and rxPacket are used, not its group classes, which give
+up a whole sync read for one missing servo, wait 35 ms for it, and drop every error byte. Also guarded here:
 
-- txPacket computes byte stuffing and drops it, so that a goal such as -131073 leaves as an ambiguous frame: the body is
-  stuffed before (`_sdk_stuffs` asks the installed SDK whether it has learnt to).
-- rxPacket may raise IndexError on odd bytes, and leaves `is_using` set when the port raises: both end in one place.
+- txPacket computes byte stuffing and drops it, so that a goal such as -131073 leaves as an ambiguous frame:
+  the body is stuffed before (`_sdk_stuffs` asks the installed SDK whether it has learnt to).
+- rxPacket may raise IndexError on odd bytes, and leaves `is_using` set when the port raises.
 - Its timeouts assume a latency timer of 16 ms: they are set here, from the bytes expected.
 - Values are unsigned there: registers carry their sign.
 """
@@ -150,10 +150,10 @@ class _Sink:
     def __init__(self) -> None:
         self.sent = b""
 
-    def clearPort(self) -> None:  # noqa: N802
+    def clearPort(self) -> None:
         pass
 
-    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+    def writePort(self, packet: Sequence[int]) -> int:
         self.sent = bytes(packet)
         return len(packet)
 
@@ -257,7 +257,11 @@ class Driver:
             if whole:
                 id = frame[4]
                 reply = Reply(frame[8], bytes(frame[9 : 5 + (frame[5] | frame[6] << 8)]))
-                if id in wanted and id not in replies and (reply.error & ~ALERT or len(reply.data) == wanted[id]):
+                if (
+                    id in wanted
+                    and id not in replies
+                    and (reply.error & ~ALERT or len(reply.data) == wanted[id])
+                ):
                     replies[id] = reply
                     self.alerts[id] = bool(reply.error & ALERT)
                 else:
@@ -269,7 +273,7 @@ class Driver:
         return replies
 
     def ask(self, packet: Packet, length: int = 0) -> Reply:
-        """Send an instruction to one servo until it answers; NoAnswer after the retries, Refused for an error."""
+        """Send an instruction to one servo until it answers; NoAnswer after the retries, Refused on error."""
         id = packet.id
         body = bytes((packet.instruction,)) + packet.params
         for attempt in range(self.retries + 1):
@@ -302,13 +306,11 @@ class Driver:
     def _found(self, id: int, data: bytes) -> Found:
         number, firmware = data[0] | data[1] << 8, data[2]
         try:
-            table = control_table(number)
+            self.tables[id] = control_table(number)
         except HardwareError:
-            table = None
-        else:
-            self.tables[id] = table
+            self.tables.pop(id, None)
         self.firmware[id] = firmware
-        return Found(id, self.port.getBaudRate(), number, firmware, table)
+        return Found(id, self.port.getBaudRate(), number, firmware, self.tables.get(id))
 
     def register(self, id: int, name: str) -> Register:
         """Row of a servo's control table; the servo must have been pinged or scanned."""
@@ -339,7 +341,9 @@ class Driver:
             self.ask(packets.write(id, row.address, row.encode(raw)))
         except Refused as e:
             raise Refused(
-                id, e.error, f"{self.label(id)} refused {row.to_si(raw):.4g} {row.unit} for {name}: {_hint(e.error)}"
+                id,
+                e.error,
+                f"{self.label(id)} refused {row.to_si(raw):.4g} {row.unit} for {name}: {_hint(e.error)}",
             ) from None
         except NoAnswer:
             if self.read_raw(id, name) != raw:  # silent on purpose (status return level), or really lost
@@ -376,7 +380,7 @@ class Driver:
             run = self.tables[id].indirect[0]
             if len(addresses) > run.count:
                 raise HardwareError(
-                    f"{self.label(id)} has {run.count} indirect registers in a row, {len(addresses)} are wanted"
+                    f"{self.label(id)} has {run.count} indirect registers, {len(addresses)} are wanted"
                 )
             self.write_bytes(id, run.address, struct.pack(f"<{len(addresses)}H", *addresses))
             spans[id] = (run.data, len(addresses))
@@ -403,8 +407,8 @@ class Driver:
     def read_block(self, block: Block, *, retries: int | None = None) -> dict[int, Reply]:
         """Read a block of all servos in one transaction; who did not answer is asked again, then left out.
 
-        A fast sync read where every firmware has it. A servo that is missing silences those behind it: it is asked
-        last the next time.
+        A fast sync read where every firmware has it. A servo that is missing silences those behind it: it is
+        asked last the next time.
         """
         replies = self._read_many(block, block.ids, fast=self._fast(block))
         for _ in range(self.retries if retries is None else retries):
@@ -488,7 +492,8 @@ class Driver:
         status_ = 8 + 4 * n + size if fast else STATUS * n + size
         count = head + status_ + ((14 + 5 * n) if goals else 0)
         delays = [self.return_delay.get(i, FACTORY_RETURN_DELAY) for i in block.ids]
-        return count * BITS_PER_BYTE / self.port.getBaudRate() + (max(delays) if fast else sum(delays))
+        wire = count * BITS_PER_BYTE / float(self.port.getBaudRate())
+        return wire + (max(delays) if fast else sum(delays))
 
     # Finding servos.
 
@@ -497,13 +502,16 @@ class Driver:
         self.send(BROADCAST, bytes((packets.Instruction.PING,)))
         wire = 14 * 253 * BITS_PER_BYTE / self.port.getBaudRate()
         self.port.setPacketTimeoutMillis((wire + SCAN_SLOT * 253 + self.margin) * 1e3)
-        return {i: self._found(i, r.data) for i, r in sorted(self._collect(dict.fromkeys(range(253), 3)).items())}
+        return {
+            i: self._found(i, r.data) for i, r in sorted(self._collect(dict.fromkeys(range(253), 3)).items())
+        }
 
     def scan(
         self, bauds: Iterable[int] = BAUD_RATES.values(), *, progress: Callable[[int], None] | None = None
     ) -> list[Found]:
         """Servos at every bit rate that the port can do, each twice asked; the old bit rate comes back."""
-        before, found = self.port.getBaudRate(), []
+        before = self.port.getBaudRate()
+        found: list[Found] = []
         try:
             for baud in bauds:
                 if progress:

@@ -1,7 +1,8 @@
 """Where bytes and time come from: a serial port, or virtual servos in memory, under one face.
 
-A port has the methods that the packet handler of dynamixel_sdk calls. `SerialPort` replaces the SDK's own PortHandler,
-which reads in a busy loop, measures timeouts with the wall clock and lets two programs open one device.
+A port has the methods that the packet handler of dynamixel_sdk calls. `SerialPort` replaces the SDK's own
+PortHandler, which reads in a busy loop, measures timeouts with the wall clock and lets two programs open one
+device.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ class SerialPort:
         self.packet_timeout = 0.0
         self._serial: Any = None
 
-    def openPort(self) -> bool:  # noqa: N802
+    def openPort(self) -> bool:
         """Open at the present bit rate."""
         import serial
 
@@ -108,13 +109,13 @@ class SerialPort:
         self.is_using = False
         return True
 
-    def closePort(self) -> None:  # noqa: N802
+    def closePort(self) -> None:
         """Close, if open."""
         if self._serial is not None:
             self._serial.close()
         self.is_open = False
 
-    def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802
+    def setBaudRate(self, baudrate: int) -> bool:
         """Set the bit rate [bit/s]; False for one that the device refuses."""
         self.baudrate = baudrate
         if not self.is_open:
@@ -125,27 +126,27 @@ class SerialPort:
             return False
         return True
 
-    def getBaudRate(self) -> int:  # noqa: N802
+    def getBaudRate(self) -> int:
         """Bit rate [bit/s]."""
         return self.baudrate
 
-    def clearPort(self) -> None:  # noqa: N802
+    def clearPort(self) -> None:
         """Forget bytes that have arrived."""
         self._guard(self._serial.reset_input_buffer)
 
-    def readPort(self, length: int) -> bytes:  # noqa: N802
+    def readPort(self, length: int) -> bytes:
         """At most `length` bytes; waits a little for them, instead of a busy loop."""
         return bytes(self._guard(self._serial.read, length))
 
-    def writePort(self, packet: bytes | list[int]) -> int:  # noqa: N802
+    def writePort(self, packet: bytes | list[int]) -> int:
         """Send bytes."""
         return int(self._guard(self._serial.write, bytes(packet)) or 0)
 
-    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
+    def setPacketTimeoutMillis(self, msec: float) -> None:
         """Start a timeout [ms]."""
         self.packet_start_time, self.packet_timeout = time.perf_counter(), msec
 
-    def isPacketTimeout(self) -> bool:  # noqa: N802
+    def isPacketTimeout(self) -> bool:
         """Whether the timeout has passed; then it is cleared."""
         if (time.perf_counter() - self.packet_start_time) * 1000.0 > self.packet_timeout:
             self.packet_timeout = 0.0
@@ -158,10 +159,14 @@ class SerialPort:
         try:
             return call(*args)
         except (serial.SerialException, OSError, TypeError, AttributeError) as e:
-            raise BusError(f"port {self.port_name} is gone ({e}): is the cable in, the adapter powered?") from None
+            raise BusError(
+                f"port {self.port_name} is gone ({e}): is the cable in, the adapter powered?"
+            ) from None
 
 
-def open_port(name: str, baud: int, *, bus: VirtualBus | None = None, paced: bool = False) -> tuple[Any, Clock]:
+def open_port(
+    name: str, baud: int, *, bus: VirtualBus | None = None, paced: bool = False
+) -> tuple[Any, Clock]:
     """Open a port and its clock; with `bus`, virtual servos in memory take the place of the device `name`."""
     if bus is not None:
         from .virtual import MemoryPort
