@@ -297,7 +297,7 @@ def test_lookup_names_and_indices_agree():
     model = mujoco.MjModel.from_xml_string(
         world(
             '<body><geom name="geom1" size="1"/><geom size="1"/><geom size="1"/>'
-            '<joint/><joint name="j"/></body>'
+            '<joint/><joint name="j" axis="1 0 0"/></body>'
         )
     )
     assert models.names_of(model, "geom") == ("geom1", "geom1_", "geom2")
