@@ -69,8 +69,13 @@ def memory(bus: VirtualBus, baud: int = 1_000_000) -> Lane:
 
 
 @pytest.fixture(params=["memory", "pty"])
-def lane(request) -> Iterator[Callable[..., Lane]]:
-    """Makes a lane of servos; the pseudo-terminal is opened by the SDK's own PortHandler."""
+def lane(request, monkeypatch) -> Iterator[Callable[..., Lane]]:
+    """Makes a lane of servos; the pseudo-terminal is opened by the SDK's own PortHandler.
+
+    In real time the SDK's patience of 34 ms is too short for a machine that tests other things meanwhile.
+    """
+    if request.param == "pty":
+        monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 100)
     cleanup: list[Callable[[], None]] = []
 
     def make(chain: list[VirtualServo], **options: Any) -> Lane:
@@ -465,8 +470,7 @@ def test_a_run_is_the_same_every_time():
 )
 def test_wire_faults(lane, kind, direction, outcome):
     """A write is done or not, and the host learns it or not, as the fault says; afterwards all is well."""
-    start = 0.0
-    plan = FaultPlan((WireFault(kind, 1.0, direction, servo=1, start=start, stop=0.25, delay=0.1),), seed=3)
+    plan = FaultPlan((WireFault(kind, 1.0, direction, servo=1, stop=0.6, delay=0.35),), seed=3)
     there = lane(servos(2), faults=plan)
     result, _ = SDK.write1ByteTxRx(there.port, 1, LED, 1)
     if outcome is not None:
@@ -476,7 +480,7 @@ def test_wire_faults(lane, kind, direction, outcome):
     assert there.bus.dice.count[kind] >= 1
     done = direction == "status" or kind == "noise"
     assert there.bus[1].get("led") == (1 if done else 0)
-    there.wait(0.4)
+    there.wait(max(0.0, 0.8 - there.bus.time))
     assert SDK.read1ByteTxRx(there.port, 1, LED) == (int(done), COMM_SUCCESS, 0)
     assert SDK.ping(there.port, 2)[1] == COMM_SUCCESS
 
@@ -509,9 +513,9 @@ def test_lost_packets_are_as_frequent_as_asked():
     ],
 )
 def test_hardware_errors_on_demand(lane, kind, bit):
-    there = lane(servos(2), faults=FaultPlan(servos=(ServoFault(kind, 1, 0.05),)))
+    there = lane(servos(2), faults=FaultPlan(servos=(ServoFault(kind, 1, 0.25),)))
     torque_on(there, 1, 2)
-    there.wait(0.1)
+    there.wait(0.3 - there.bus.time)
     value, _, error = SDK.read1ByteTxRx(there.port, 1, 70)
     assert (value, error) == (bit, 0x80)
     shut = bool(52 & bit)
@@ -520,25 +524,25 @@ def test_hardware_errors_on_demand(lane, kind, bit):
 
 
 def test_a_servo_dies_and_comes_back(lane):
-    there = lane(servos(2), faults=FaultPlan(servos=(ServoFault("dead", 1, 0.1, 0.4),)))
+    there = lane(servos(2), faults=FaultPlan(servos=(ServoFault("dead", 1, 0.3, 0.9),)))
     torque_on(there, 1)
-    there.wait(0.15)
+    there.wait(0.35 - there.bus.time)
     assert SDK.ping(there.port, 1)[1] == COMM_RX_TIMEOUT
     assert SDK.ping(there.port, 2)[1] == COMM_SUCCESS
-    there.wait(0.5)
+    there.wait(max(0.0, 1.1 - there.bus.time))
     assert SDK.read1ByteTxRx(there.port, 1, TORQUE) == (0, COMM_SUCCESS, 0)
 
 
 def test_watchdog_on_demand_and_by_silence(lane):
     there = lane(servos(2, bus_watchdog=0), faults=FaultPlan(servos=(ServoFault("watchdog", 1, 0.02),)))
     torque_on(there, 1, 2)
-    assert SDK.write1ByteTxRx(there.port, 2, 98, 2) == (COMM_SUCCESS, 0)
+    assert SDK.write1ByteTxRx(there.port, 2, 98, 15) == (COMM_SUCCESS, 0)
     for _ in range(10):
-        there.wait(0.01)
+        there.wait(0.05)
         assert SDK.read1ByteTxRx(there.port, 1, 98)[1] == COMM_SUCCESS  # any packet feeds every servo
     assert there.bus[1].get("bus_watchdog") == -1
-    assert there.bus[2].get("bus_watchdog") == 2
-    there.wait(0.06)
+    assert there.bus[2].get("bus_watchdog") == 15
+    there.wait(0.35)
     assert there.bus[2].get("bus_watchdog") == -1
 
 

@@ -81,7 +81,8 @@ def test_trapezoid_from_rest_is_the_textbooks(x, goal, speed, acceleration):
     reaches = way > speed**2 / acceleration
     duration = way / speed + speed / acceleration if reaches else 2 * sqrt(way / acceleration)
     assert t.duration == pytest.approx(duration, rel=1e-9, abs=1e-9)
-    assert t.kind == (TRAPEZOIDAL if reaches else TRIANGULAR)
+    if abs(way - speed**2 / acceleration) > 1e-9 * way:
+        assert t.kind == (TRAPEZOIDAL if reaches else TRIANGULAR)
     _, peak = t.at(duration / 2)
     assert abs(peak) == pytest.approx(min(speed, sqrt(way * acceleration)), rel=1e-6, abs=1e-9)
     ramp = abs(peak) / acceleration  # between these corners the velocity is linear, so that the rule is exact
