@@ -199,8 +199,7 @@ class _Run:
             (begin, _, _), row = self._inputs(k)
             self._prescribe_state(begin, row)
         else:
-            (_, _, end), row = self._inputs(k - 1)
-            self._prescribe_state(end, row)
+            self._prescribe_state(self.timed.at(np.array([self.data.time])), 0)
 
     def _prescribe_state(self, inputs: TimedInputs, row: int) -> None:
         self.data.qpos[self.timed.qpos] = inputs.q[row]

@@ -48,7 +48,7 @@ class Prescriber:
         mujoco.mj_fullM(model, data, inertia)
         self.armature = STIFFNESS * np.diag(inertia)[self.keyed]
         m, mean_inertia = self.model, model.stat.meaninertia
-        m.dof_armature[self.keyed] = self.armature
+        m.dof_armature[self.keyed] += self.armature
         m.dof_frictionloss[self.keyed] = 0.0
         for joint in np.unique(m.dof_jntid[self.keyed]):
             m.jnt_limited[joint] = 0
