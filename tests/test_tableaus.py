@@ -56,10 +56,10 @@ def test_cruder_estimate_of_dop853_has_order_3():
 def test_dense_output_has_exactly_the_stated_order(method, theta):
     dense = method.dense
     A = extended(method)
-    powers = theta ** np.arange(1, dense.P.shape[1] + 1)
+    powers = theta * (2 * theta - 1) ** np.arange(dense.P.shape[1])
     conditions = OrderConditions(A)
-    # The polynomials cancel: evaluating them rounds by up to `terms` units of sum_j |P_ij| theta^j.
-    cancellation = 2 * len(powers) * (np.abs(dense.P) @ powers)
+    # The polynomials cancel: evaluating them rounds by up to `terms` units of theta sum_j |P_ij x^j|.
+    cancellation = 2 * len(powers) * (np.abs(dense.P) @ np.abs(powers))
     for order in range(1, dense.order + 2):
         residual, rounding = conditions.residuals(
             dense.P @ powers, order, target=theta, magnitude=cancellation
@@ -74,17 +74,23 @@ def test_dense_output_has_exactly_the_stated_order(method, theta):
 def test_dense_output_joins_smoothly(method):
     """At both ends the slope is the first stage and the stage at the end of the step."""
     P = method.dense.P
-    degrees = np.arange(1, P.shape[1] + 1)
+    degrees = np.arange(P.shape[1])
     end = method.stages - 1 if method.fsal else method.stages
-    rounding = 1e-15 * (np.abs(P) @ degrees)
-    assert np.all(np.abs(P[:, 0] - np.eye(len(P))[0]) <= rounding)
-    assert np.all(np.abs(P @ degrees - np.eye(len(P))[end]) <= rounding)
+    rounding = 1e-15 * (np.abs(P) @ (1 + 2 * degrees))
+    at_start, at_end = P @ (-1.0) ** degrees, P @ (1 + 2 * degrees)
+    assert np.all(np.abs(at_start - np.eye(len(P))[0]) <= rounding)
+    assert np.all(np.abs(at_end - np.eye(len(P))[end]) <= rounding)
 
 
 def test_coefficients_are_those_of_an_independent_library():
     np.testing.assert_allclose(DOPRI5.A[:6, :5], SCIPY_RK45.A, rtol=1e-15)
     np.testing.assert_allclose(DOPRI5.b[:6], SCIPY_RK45.B, rtol=1e-15)
-    np.testing.assert_allclose(DOPRI5.dense.P, SCIPY_RK45.P, rtol=1e-14)
+    theta = np.linspace(0, 1, 9)
+    np.testing.assert_allclose(
+        DOPRI5.dense.P @ (theta * (2 * theta - 1) ** np.arange(4)[:, None]),
+        SCIPY_RK45.P @ theta ** np.arange(1, 5)[:, None],
+        atol=1e-14,
+    )
     np.testing.assert_allclose(DOPRI5.b_error, -SCIPY_RK45.E, rtol=1e-15)
     np.testing.assert_array_equal(DOP853.A, SCIPY_DOP853.A)
     np.testing.assert_array_equal(DOP853.b, SCIPY_DOP853.B)

@@ -85,10 +85,7 @@ def _crossings(event: Event, side: float, step: Step) -> tuple[list[float], floa
     end = g(1.0)
     start = 0.0
     if side == 0:
-        start = resolution
-        side = float(np.sign(g(start)))
-        if side == 0:
-            return [], float(np.sign(end))
+        side, start = _departure(event, step, resolution)
     knots = [start]
     if side * end > 0 and _dips(event, side, step):
         bottom = minimize_scalar(lambda theta: side * g(theta), bounds=(0.0, 1.0), method="bounded").x
@@ -104,6 +101,25 @@ def _crossings(event: Event, side: float, step: Step) -> tuple[list[float], floa
             roots.append(a if crossed else float(brentq(g, a, b, xtol=resolution, rtol=4 * EPS)))
         side = -side
     return roots, side
+
+
+def _departure(event: Event, step: Step, resolution: float) -> tuple[float, float]:
+    """The side of zero at the start of a step, and the place from which on it holds.
+
+    Where the start itself is a zero, the motion along f there tells, just far enough to see it.
+    """
+
+    def along(theta: float) -> float:
+        dt = theta * step.h
+        return float(event.g(step.t + dt, step.y + dt * step.f_start))
+
+    first = along(0.0)
+    if abs(first) > 1e-12 * abs(along(1.0) - first):
+        return float(np.sign(first)), 0.0
+    theta = resolution
+    while theta < 1 and along(theta) == 0:
+        theta *= 4
+    return float(np.sign(along(theta))), min(theta, 1.0)
 
 
 def _dips(event: Event, side: float, step: Step) -> bool:

@@ -64,11 +64,11 @@ class Step:
             return self.y
         if theta >= 1:
             return self.y_end
-        powers = theta ** np.arange(1, self.method.dense.P.shape[1] + 1)
-        return self.problem.project(self.y + self.h * (self.coefficients() @ powers))
+        powers = (2 * theta - 1) ** np.arange(self.method.dense.P.shape[1])
+        return self.problem.project(self.y + theta * self.h * (self.coefficients() @ powers))
 
     def coefficients(self) -> Array:
-        """Slope of the dense output by powers of theta, shape (ndim, degree); evaluates the extra stages."""
+        """(Dense output - y) / (theta h) by powers of x, shape (ndim, degree); evaluates the extra stages."""
         if self._Q is None:
             s, dense = self.method.stages, self.method.dense
             for i, (row, c) in enumerate(zip(dense.A, dense.c, strict=True), start=s):

@@ -27,11 +27,11 @@ def stages(rows: Sequence[Sequence[float]], width: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Dense:
-    """Continuous extension of a step: y(t + theta h) = y + h sum_ij P[i, j] theta^(j + 1) k_i.
+    """Continuous extension of a step: y(t + theta h) = y + theta h sum_ij P[i, j] x^j k_i, x = 2 theta - 1.
 
-    Here 0 <= theta <= 1. Its stages are the s stages of the step followed by m extra ones,
-    k_i = f(t + c_i h, y + h sum_j A_ij k_j), computed only in steps that are looked into. Unless the method
-    is FSAL the first extra stage is f at the end of the step, which the next step needs anyway.
+    Here 0 <= theta <= 1; powers of x cancel far less than those of theta. The stages are the s of the step
+    followed by m extra ones, k_i = f(t + c_i h, y + h sum_j A_ij k_j), computed only in steps that are looked
+    into. Unless the method is FSAL the first extra stage is f at its end, which the next step needs.
 
     Attributes:
         order: the extension satisfies the continuous order conditions up to this order: its error within one
@@ -139,14 +139,14 @@ class Tableau:
 def hermite(b: Array, *, fsal: bool, order: int) -> Dense:
     """Cubic Hermite extension through both ends and their slopes, of order min(order, 3).
 
-    y(theta) = y0 + (3 theta^2 - 2 theta^3)(y1 - y0) + (theta - 2 theta^2 + theta^3) h f0
-    + (theta^3 - theta^2) h f1 (Hairer, Norsett & Wanner I, II.6).
+    y = y0 + (3 theta^2 - 2 theta^3)(y1 - y0) + (theta - 2 theta^2 + theta^3) h f0 + (theta^3 - theta^2) h f1
+    (Hairer, Norsett & Wanner I, II.6), over theta and in powers of x = 2 theta - 1.
     """
     s, m = len(b), 0 if fsal else 1
     P = np.zeros((s + m, 3))
-    P[:s, 1], P[:s, 2] = 3 * b, -2 * b
-    P[0] += (1, -2, 1)
-    P[-1] += (0, -1, 1)
+    P[:s] += np.outer(b, (1.0, 1 / 2, -1 / 2))
+    P[0] += (1 / 4, -1 / 2, 1 / 4)
+    P[-1] += (-1 / 4, 0.0, 1 / 4)
     A = np.zeros((m, s + m))
     A[:, :s] = b
     return Dense(order=min(order, 3), A=frozen(A), c=frozen(np.ones(m)), P=frozen(P))
