@@ -34,19 +34,9 @@ class Context:
 
     def close(self) -> None:
         """Destroy this context alone; closing again does nothing."""
-        platform, self._platform = self._platform, None
-        if platform is None:
-            return
-        if self.kind == "egl":
-            # pyrender's own delete_context terminates the display that every renderer of the process shares.
-            from OpenGL import EGL
-
-            display, context = platform._egl_display, platform._egl_context
-            platform._egl_display = None
-            EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
-            EGL.eglDestroyContext(display, context)
-        else:
-            platform.delete_context()
+        if self._platform is not None:
+            self._platform.delete_context()
+            self._platform = None
 
 
 def _load() -> str:
@@ -111,17 +101,33 @@ def _egl_answers() -> bool:
 
 
 def _egl_platform() -> Any:
-    """The first EGL device on which a context can be made; a listed GPU may be out of reach."""
+    """A context on the first EGL device that gives one; a listed GPU may be out of reach."""
+    from OpenGL import EGL
     from pyrender.platforms import egl
+
+    class SharedDisplay(egl.EGLPlatform):  # type: ignore[misc]
+        """pyrender's platform, less its eglTerminate: all renderers of the process share the display.
+
+        Its destructor calls `delete_context` as well, at any time: what is current stays current.
+        """
+
+        def delete_context(self) -> None:
+            display, context = self._egl_display, self._egl_context
+            self._egl_display = self._egl_context = None
+            if display is None or context is None:
+                return
+            current = EGL.eglGetCurrentContext()
+            if ctypes.cast(current, ctypes.c_void_p).value == ctypes.cast(context, ctypes.c_void_p).value:
+                EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+            EGL.eglDestroyContext(display, context)
 
     devices = egl.query_devices() if egl._eglQueryDevicesEXT is not None else [egl.EGLDevice(None)]
     failures = []
     for device in devices:
-        platform = egl.EGLPlatform(1, 1, device=device)
+        platform = SharedDisplay(1, 1, device=device)
         try:
             platform.init_context()
         except Exception as error:
-            platform._egl_display = None  # keeps its destructor from terminating a shared display
             failures.append(f"{device}: {error or type(error).__name__}")
         else:
             return platform

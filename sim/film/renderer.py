@@ -92,7 +92,7 @@ class Renderer:
         """The picture (height, width, 3) of configuration `q` (nq,); time `t` (s) keys camera and lights."""
         X_WC, fovy = self._pose(q, t, camera)
         lights = self._lights_at(t, X_WC)
-        X_WG = self._send_poses(X_WC, fovy)
+        X_WG = self._send_poses(X_WC, 2 * np.tan(fovy / 2) / self.height)
         maps = self._draw_shadow_maps(lights, X_WG)
         self._picture.begin(depth=False)
         self._draw_forward(X_WC, fovy, lights, maps)
@@ -101,7 +101,7 @@ class Renderer:
     def depth(self, q: ArrayLike, t: float = 0.0, *, camera: Camera) -> NDArray[np.float32]:
         """Distance in metres along the line of sight's axis (height, width), infinite where nothing is."""
         X_WC, fovy = self._pose(q, t, camera)
-        self._send_poses(X_WC, fovy)
+        self._send_poses(X_WC, 0.0)
         self._picture.begin(depth=True)
         self._draw_depth([s for s, _ in self._surfaces], self._view_projection(X_WC, fovy))
         near, far = self._range
@@ -207,14 +207,13 @@ class Renderer:
             return "checker"
         return self._textures[batch.material.texture][0] if batch.material.texture >= 0 else "none"
 
-    def _send_poses(self, X_WC: Floats, fovy: float) -> NDArray[np.float32]:
-        """World poses of all geoms (ngeom, 4, 4), also sent to the surfaces."""
+    def _send_poses(self, X_WC: Floats, slope: float) -> NDArray[np.float32]:
+        """World poses of all geoms (ngeom, 4, 4), also sent to the surfaces with the slope of a pixel."""
         X_WG = np.zeros((self.model.ngeom, 4, 4), dtype=np.float32)
         X_WG[:, :3, :3] = self._data.geom_xmat.reshape(-1, 3, 3)
         X_WG[:, :3, 3] = self._data.geom_xpos
         X_WG[:, 3, 3] = 1
         columns = np.ascontiguousarray(X_WG.transpose(0, 2, 1))
-        slope = 2 * np.tan(fovy / 2) / self.height
         for surface, _ in self._surfaces:
             surface.place(columns, X_WC[:3, 3], slope)
         return X_WG

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
 
-_SEGMENTS = 32  # round the axis of a curved shape: outlines true to 0.5 % of the radius
-_RINGS = 16  # from pole to pole
+SEGMENTS = 96  # round the axis of a curved shape: surfaces true to 0.1 % of the radius
 _CREASE = np.deg2rad(35.0)  # faces that meet at a sharper angle are shaded apart
 
 
@@ -24,11 +23,14 @@ class Shape:
     uv: Floats | None = None
 
 
-def geom_shape(model: mujoco.MjModel, geom: int, *, plane_radius: float) -> Shape | None:
+def geom_shape(
+    model: mujoco.MjModel, geom: int, *, plane_radius: float, segments: int = SEGMENTS
+) -> Shape | None:
     """The surface of a geom in its own frame, or None for a type that has none.
 
     A plane's infinite directions (size 0) end at `plane_radius` metres. Primitives carry MuJoCo's texture
-    coordinates, once over each face or round the shape; meshes their own where they have them.
+    coordinates, once over each face or round the shape; meshes their own where they have them. Curved
+    primitives have `segments` (a multiple of 4) sides round the axis, half as many from pole to pole.
     """
     kind = mujoco.mjtGeom(model.geom_type[geom])
     size = model.geom_size[geom]
@@ -37,13 +39,13 @@ def geom_shape(model: mujoco.MjModel, geom: int, *, plane_radius: float) -> Shap
     if kind == types.mjGEOM_PLANE:
         return _plane(size[:2], plane_radius)
     if kind == types.mjGEOM_SPHERE:
-        return _ellipsoid(np.full(3, size[0]))
+        return _ellipsoid(np.full(3, size[0]), segments)
     if kind == types.mjGEOM_ELLIPSOID:
-        return _ellipsoid(size)
+        return _ellipsoid(size, segments)
     if kind == types.mjGEOM_CAPSULE:
-        return _capsule(size[0], size[1])
+        return _capsule(size[0], size[1], segments)
     if kind == types.mjGEOM_CYLINDER:
-        return _cylinder(size[0], size[1])
+        return _cylinder(size[0], size[1], segments)
     if kind == types.mjGEOM_BOX:
         return _box(size)
     if kind == types.mjGEOM_HFIELD and data >= 0:
@@ -69,9 +71,9 @@ def _grid_indices(rows: int, columns: int) -> NDArray[np.integer]:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def _revolved(r: Floats, z: Floats, normal_r: Floats, normal_z: Floats, v: Floats) -> Shape:
+def _revolved(r: Floats, z: Floats, normal_r: Floats, normal_z: Floats, v: Floats, segments: int) -> Shape:
     """A profile, from bottom to top, turned about z; `v` (one a ring) is its texture coordinate."""
-    turn = np.linspace(0, 1, _SEGMENTS + 1)
+    turn = np.linspace(0, 1, segments + 1)
     cosine, sine = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
 
     def turned(r: Floats, z: Floats) -> Floats:
@@ -82,31 +84,31 @@ def _revolved(r: Floats, z: Floats, normal_r: Floats, normal_z: Floats, v: Float
     return Shape(turned(r, z), turned(normal_r, normal_z), _grid_indices(len(r), len(turn)), uv)
 
 
-def _ellipsoid(size: Floats) -> Shape:
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, _RINGS + 1)
+def _ellipsoid(size: Floats, segments: int) -> Shape:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     r, z = np.cos(latitude), np.sin(latitude)
-    unit = _revolved(r, z, r, z, 0.5 - latitude / np.pi)
+    unit = _revolved(r, z, r, z, 0.5 - latitude / np.pi, segments)
     normals = unit.positions / size
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Shape(unit.positions * size, normals, unit.indices, unit.uv)
 
 
-def _capsule(radius: float, half: float) -> Shape:
-    latitude = np.linspace(0, np.pi / 2, _RINGS // 2 + 1)
+def _capsule(radius: float, half: float, segments: int) -> Shape:
+    latitude = np.linspace(0, np.pi / 2, segments // 4 + 1)
     below, above = -latitude[::-1], latitude
     # Each hemisphere and the barrel between them carry the whole image, so the rims come twice.
     angle = np.concatenate([below, [0.0, 0.0], above])
     r, z = np.cos(angle), np.sin(angle)
     shift = np.concatenate([np.full(len(below) + 1, -half), np.full(len(above) + 1, half)])
     v = np.concatenate([-2 * below / np.pi, [1.0, 0.0], 1 - 2 * above / np.pi])
-    return _revolved(radius * r, radius * z + shift, r, z, v)
+    return _revolved(radius * r, radius * z + shift, r, z, v, segments)
 
 
-def _cylinder(radius: float, half: float) -> Shape:
+def _cylinder(radius: float, half: float, segments: int) -> Shape:
     r = np.array([0.0, radius, radius, radius, radius, 0.0])
     z = half * np.array([-1.0, -1, -1, 1, 1, 1])
     normal_r, normal_z = np.array([0.0, 0, 1, 1, 0, 0]), np.array([-1.0, -1, 0, 0, 1, 1])
-    whole = _revolved(r, z, normal_r, normal_z, (1 - z / half) / 2)
+    whole = _revolved(r, z, normal_r, normal_z, (1 - z / half) / 2, segments)
     lids = np.abs(whole.normals[:, 2:]) > 0.5
     uv = np.where(lids, 0.5 + whole.positions[:, :2] / (2 * radius), np.asarray(whole.uv))
     return Shape(whole.positions, whole.normals, whole.indices, uv)
@@ -205,6 +207,31 @@ def crease_normals(vertices: Floats, faces: NDArray[np.integer], crease: float) 
     normals: Floats = np.empty_like(total)
     normals[order] = total
     return normals.reshape(-1, 3, 3)
+
+
+def levels(model: mujoco.MjModel, geom: int, shape: Shape, *, pixel: float) -> list[tuple[float, Shape]]:
+    """Coarser forms of a geom's surface, each with how far (m) it may stray from it, finest first.
+
+    Curved primitives get fewer sides; meshes are merged over cells of about a `pixel` (m). A form is kept
+    only when it saves a third of the triangles.
+    """
+    types = mujoco.mjtGeom
+    kind = int(model.geom_type[geom])
+    found: list[tuple[float, Shape]] = []
+    if kind in (types.mjGEOM_SPHERE, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER, types.mjGEOM_ELLIPSOID):
+        radius = float(model.geom_size[geom][: 3 if kind == types.mjGEOM_ELLIPSOID else 1].max())
+        for segments in (48, 24, 12):
+            simple = geom_shape(model, geom, plane_radius=1.0, segments=segments)
+            assert simple is not None
+            found.append((2 * radius * (1 - float(np.cos(np.pi / segments))), simple))
+    elif kind in (types.mjGEOM_MESH, types.mjGEOM_SDF):
+        least = len(shape.indices)
+        for cell in (0.35 * pixel, 0.7 * pixel, 1.4 * pixel):
+            simple = coarse(shape, cell)
+            if 0 < len(simple.indices) < 0.7 * least:
+                found.append((0.5 * cell, simple))
+                least = len(simple.indices)
+    return found
 
 
 def coarse(shape: Shape, cell: float) -> Shape:

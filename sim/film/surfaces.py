@@ -7,44 +7,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .drawing import Batch
-from .shapes import Shape, coarse
+from .shapes import Shape, levels
 
 Floats = NDArray[np.floating]
 
-_LEVELS = (0.35, 0.7, 1.4)  # widths of merged cells, in pixels of a picture as high as the model is large
-_UNSEEN = 0.7  # a cell of this many pixels does not show
+_UNSEEN = 0.35  # of a pixel: an error that does not show
 
 
 class Surface:
     """A batch in the current context; `place` sends the poses of its geoms, `draw` draws them.
 
-    Meshes are kept at several levels of detail as well; `place` takes the coarsest whose merged cells stay
-    below a pixel. `pixel`: metres that a pixel spans in a picture as high as the model is large.
+    Curved geoms and meshes are kept at several levels of detail; `place` takes the coarsest whose error
+    does not show. `pixel`: metres that a pixel spans in a picture as high as the model is large.
     """
 
     def __init__(self, batch: Batch, model: mujoco.MjModel, *, pixel: float) -> None:
+        geom, count = int(batch.geoms[0]), len(batch.geoms)
         self.batch = batch
-        self.reach = float(model.geom_rbound[batch.geoms[0]])
-        self._levels = [(0.0, _uploaded(batch.shape, len(batch.geoms)))]
-        self._cull = not batch.ground and int(model.geom_type[batch.geoms[0]]) != mujoco.mjtGeom.mjGEOM_HFIELD
-        if int(model.geom_type[batch.geoms[0]]) in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
-            finest = batch.shape
-            for width in _LEVELS:
-                shape = coarse(batch.shape, width * pixel)
-                if 0 < len(shape.indices) < 0.7 * len(finest.indices):
-                    self._levels.append((width * pixel, _uploaded(shape, len(batch.geoms))))
-                    finest = shape
+        self._reach = float(model.geom_rbound[geom])
+        self._cull = not batch.ground and int(model.geom_type[geom]) != mujoco.mjtGeom.mjGEOM_HFIELD
+        self._levels = [(0.0, _uploaded(batch.shape, count))]
+        self._levels += [
+            (error, _uploaded(shape, count)) for error, shape in levels(model, geom, batch.shape, pixel=pixel)
+        ]
         self._now = self._levels[0][1]
 
     def place(self, X_WG: NDArray[np.float32], eye: Floats, pixel_slope: float) -> None:
-        """Send poses (ngeom, 4, 4), columns first; `pixel_slope`: metres per pixel, per metre of distance."""
+        """Send poses (ngeom, 4, 4), columns first; `pixel_slope`: metres per pixel, per metre of distance.
+
+        With a slope of 0 the exact form is drawn.
+        """
         from OpenGL import GL
 
         poses = X_WG[self.batch.geoms]
         if len(self._levels) > 1:
-            nearest = np.linalg.norm(poses[:, 3, :3] - eye, axis=1).min() - self.reach
-            finest = _UNSEEN * pixel_slope * max(float(nearest), 0.0)
-            self._now = next(level for cell, level in reversed(self._levels) if cell <= finest)
+            nearest = np.linalg.norm(poses[:, 3, :3] - eye, axis=1).min() - self._reach
+            allowed = _UNSEEN * pixel_slope * max(float(nearest), 0.0)
+            self._now = next(level for error, level in reversed(self._levels) if error <= allowed)
         # pyrender reads `Primitive.poses` once, at the upload; its second buffer is the one in use.
         GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._now._buffers[1])
         GL.glBufferSubData(GL.GL_ARRAY_BUFFER, 0, poses.nbytes, np.ascontiguousarray(poses))

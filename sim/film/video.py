@@ -195,9 +195,9 @@ def _spool(frames: Iterable[Frame], spool: IO[bytes], kept: _Kept) -> tuple[Any,
         for frame in frames:
             shape = frame.shape
             stored = spool.write(zlib.compress(frame.tobytes(), 1))
-            samples.append(frame.reshape(-1, 3)[kept.frames % stride :: stride])
+            samples.append(frame.reshape(-1, 3)[kept.frames % stride :: stride].copy())
             if sum(map(len, samples)) > 2_000_000:  # a long film: thin the samples, take fewer from now on
-                samples, stride = [sample[::2] for sample in samples[::2]], 4 * stride
+                samples, stride = [sample[::2].copy() for sample in samples[::2]], 4 * stride
             sizes.append(stored)
             kept.frames += 1
     pixels = np.concatenate(samples)
