@@ -1,9 +1,9 @@
 """Can the rig make this motion? A verdict before anything moves, and how much slower it could.
 
 A motion slowed k times has, with x = 1/k, the speeds v x, the accelerations a x^2 and the forces
-static + viscous x + dynamic x^2; the motor gives at most stall (1 - speed / free speed). Every limit is a polynomial
-in x of degree two at most, and its first positive root is the fastest x up to which every slower motion fits as well:
-the slowdown is computed, in closed form, not searched.
+static + viscous x + dynamic x^2; the motor gives at most stall (1 - speed / free speed). Every limit is a
+polynomial in x of degree two at most, and its first positive root is the fastest x up to which every slower
+motion fits as well: the slowdown is computed, in closed form, not searched.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class MotionRefused(RigError):
 class Check:
     """The worst of one kind for one joint or servo.
 
-    peak and limit in `unit`; share: part of the limit that is used (for positions, how far beyond the middle of
-    the range, 1 at its end); at: when [s]; who: the joint or servo; slowdown: factor that makes it fit (1: fits;
-    infinite: none does).
+    peak and limit in `unit`; share: part of the limit that is used (for positions, of the way from the middle
+    of the range to its end); at: when [s]; who: the joint or servo; slowdown: factor that makes it fit (1: it
+    fits; infinite: none does).
     """
 
     kind: Kind
@@ -63,7 +63,8 @@ class Check:
                 if np.isfinite(self.slowdown)
                 else " -> no slowing helps"
             )
-        return f"{self.kind} of {self.who}: {self.peak:.4g} {self.unit} of {self.limit:.4g} at t = {self.at:.3f} s{fix}"
+        size = f"{self.peak:.4g} {self.unit}".strip()
+        return f"{self.kind} of {self.who}: {size} of {self.limit:.4g} at t = {self.at:.3f} s{fix}"
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Verdict:
 def check_motion(
     motion: Motion, mapping: Mapping, servos: Bounds, joints: JointBounds, loads: Loads | None = None
 ) -> Verdict:
-    """Hold a motion against every limit of joints and servos; without `loads`, torque is left out (and said so)."""
+    """Hold a motion against every limit of joints and servos; without `loads`, torque is left out, and noted."""
     t = motion.dense()
     q, v = motion.at(t)
     s = mapping.servo(q)
@@ -219,7 +220,7 @@ def _torque(mapping: Mapping, motion: Motion, loads: Loads, servo_v: Array, serv
 def _worst_force(
     who: str, t: Array, f0: Array, f1: Array, f2: Array, limit: float, v: Array, free_speed: float
 ) -> Check:
-    """Where |f0 + f1 x + f2 x^2| <= limit (1 - |v| x / free_speed) is nearest to broken at x = 1, or first is."""
+    """Where |f0 + f1 x + f2 x^2| <= limit (1 - |v| x / free_speed) comes nearest to breaking, or breaks."""
     force = f0 + f1 + f2
     if not np.isfinite(limit):
         k = int(np.argmax(np.abs(force)))
@@ -233,7 +234,14 @@ def _worst_force(
         x, k = _first_root(f0, f1, f2, limit, loss)
         slower = 1 / x if x > 0 else np.inf
     return Check(
-        "torque", who, abs(float(force[k])), available[k], "N m", float(share[k]), float(t[k]), slower
+        "torque",
+        who,
+        abs(float(force[k])),
+        limit * max(0.0, 1 - loss[k]),
+        "N m",
+        float(share[k]),
+        float(t[k]),
+        slower,
     )
 
 

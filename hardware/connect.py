@@ -1,0 +1,88 @@
+"""From a rig to a driver: its serial port, or virtual servos in its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .driver import Driver
+from .errors import HardwareError
+from .mapping import joint_bounds, make_bounds, make_mapping
+from .ports import latency_of, open_port
+from .rig import VIRTUAL, Rig
+from .virtual import NO_FAULTS, FaultPlan, Quirks, Timing, VirtualBus, VirtualServo
+
+Array = NDArray[np.float64]
+
+_REAL_MARGIN = 8e-3  # s beyond the wire's time: scheduling of host and adapter
+_TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind it
+
+
+def rest_pose(rig: Rig) -> Array:
+    """Joint values (nj,) in the middle of what soft limits and servos allow, zero where that allows zero."""
+    mapping, servos, joints = make_mapping(rig), make_bounds(rig), joint_bounds(rig)
+    q = np.where((joints.low <= 0) & (joints.high >= 0), 0.0, 0.5 * (joints.low + joints.high))
+    s = np.clip(mapping.servo(np.where(np.isfinite(q), q, 0.0)), servos.low, servos.high)
+    return mapping.joint(s)
+
+
+def virtual_bus(
+    rig: Rig,
+    *,
+    pose: Array | None = None,
+    faults: FaultPlan = NO_FAULTS,
+    timing: Timing | None = None,
+    firmware: int | None = None,
+    quirks: Quirks | None = None,
+) -> VirtualBus:
+    """Virtual servos of a rig, standing at joint values `pose` (nj,), torque off, as after power-on."""
+    s = make_mapping(rig).servo(rest_pose(rig) if pose is None else np.asarray(pose, dtype=float))
+    servos = [
+        VirtualServo(
+            item.model,
+            item.id,
+            baud=rig.baud,
+            position=float(angle),
+            firmware=firmware,
+            quirks=quirks or Quirks(),
+        )
+        for item, angle in zip(rig.servos, s, strict=True)
+    ]
+    return VirtualBus(servos, timing=timing or Timing(), faults=faults)
+
+
+def connect(
+    rig: Rig,
+    *,
+    port: str | None = None,
+    bus: VirtualBus | None = None,
+    pose: Array | None = None,
+    paced: bool = False,
+) -> tuple[Driver, str]:
+    """Driver of a rig and a note about its port.
+
+    ``port`` replaces the rig's; ``bus`` are virtual servos to use in memory, made for port 'virtual' when
+    missing, at joint values ``pose``; ``paced`` lets their time pass as on the wall.
+    """
+    name = port or rig.port
+    if bus is None and name == VIRTUAL:
+        bus = virtual_bus(rig, pose=pose)
+    if bus is None and not Path(name).exists():
+        from .ports import serial_devices
+
+        here = ", ".join(serial_devices()) or "none"
+        raise HardwareError(
+            f"no serial port {name}; serial devices here: {here}; without a rig, use --port {VIRTUAL}"
+        )
+    if bus is not None:
+        opened, clock = open_port(name, rig.baud, bus=bus, paced=paced)
+        return Driver(opened, clock, latency=bus.timing.latency_timer, label=rig.label), (
+            "virtual servos in memory"
+        )
+    latency = latency_of(name)
+    opened, clock = open_port(name, rig.baud)
+    terminal = Path(name).resolve().parent.name == "pts"
+    margin = _TERMINAL_MARGIN if terminal else _REAL_MARGIN
+    return Driver(opened, clock, margin=margin, latency=latency.seconds, label=rig.label), latency.note

@@ -1,0 +1,192 @@
+"""The control loop: goals out at an absolute schedule, feedback in, and a fault as soon as one can be seen."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..driver import Driver, Reply
+from ..mapping import Bounds
+from ..rig import Rig
+from ..tables.rows import CENTRE, POSITION
+from .contract import Phase, Ready, RigFault, error_names
+
+Array = NDArray[np.float64]
+
+PATIENCE = 5  # cycles without an answer, or with an old goal, after which a servo is lost
+LAGGING = 10  # cycles behind its goal after which a servo is obstructed
+HEALTH_PERIOD = 1.0  # s between looks at voltage and temperature
+_STEP_MARGIN = 1.25  # of the greatest step of a goal over velocity limit x time
+_HOT = 2.0  # K below the temperature limit at which the rig stops, before the servo lets go by itself
+# columns of the feedback block
+_X, _V, _LOAD, _ERROR, _WATCHDOG, _TORQUE, _GOAL = range(7)
+
+
+@dataclass
+class Log:
+    """What every cycle did: lists of the same length, times [s] of the bus clock, angles [rad]."""
+
+    due: list[float] = field(default_factory=list)
+    begun: list[float] = field(default_factory=list)
+    ended: list[float] = field(default_factory=list)
+    phase: list[Phase] = field(default_factory=list)
+    goal: list[Array] = field(default_factory=list)
+    feedback: list[Array] = field(default_factory=list)
+    skipped: int = 0  # cycles that were due while another was still under way
+    clamped: int = 0  # goals that software limits changed
+    lost_goals: int = 0  # goals sent that a servo was seen not to have
+    oldest_goal: int = 0  # cycles
+    hottest: float = -np.inf
+    lowest_voltage: float = np.inf
+
+
+class Loop:
+    """Streams goals to a rig that is ready and under torque.
+
+    Args:
+        driver, rig, bounds: The rig.
+        ready: From `prepare`.
+        log: Where cycles are written.
+    """
+
+    def __init__(self, driver: Driver, rig: Rig, bounds: Bounds, ready: Ready, log: Log) -> None:
+        self.driver, self.rig, self.ready, self.log = driver, rig, ready, log
+        self.period = 1.0 / rig.rate
+        self.goal = ready.present.copy()  # last one sent [rad]
+        self.present = ready.present.copy()
+        # A rig that stands outside of its soft limits may come back, not go further.
+        self._low = np.minimum(bounds.low, ready.present)
+        self._high = np.maximum(bounds.high, ready.present)
+        self._speed = bounds.velocity
+        n = len(rig.ids)
+        self._silent, self._stale, self._behind = (np.zeros(n, dtype=int) for _ in range(3))
+        self._sent: deque[Array] = deque([self._counts(self.goal)], maxlen=PATIENCE + 2)
+        self._last = driver.clock.now()
+        self._health_due = self._last
+        self._health = driver.block(rig.ids, ["present_input_voltage", "present_temperature"])
+        self._too_hot = np.array([driver.read(i, "temperature_limit") for i in rig.ids]) - _HOT
+        self._cost = driver.cycle_time(ready.block) + driver.margin
+
+    @staticmethod
+    def _counts(angle: Array) -> Array:
+        return np.rint(angle / POSITION) + CENTRE
+
+    def run(
+        self, target: Callable[[float], Array | None], duration: float, phase: Phase, *, capped: bool = True
+    ) -> None:
+        """Stream target(t) (ns,) [rad] for t from 0 to `duration` [s]; a target of None ends it.
+
+        Cycle k is due at start + k * period whatever happened before: late ones are skipped, never made up for.
+        """
+        clock, period = self.driver.clock, self.period
+        start, k = clock.now(), 0
+        last = ceil(duration / period - 1e-9) if np.isfinite(duration) else None
+        while last is None or k <= last:
+            due = start + k * period
+            clock.sleep_until(due)
+            goal = target(min(k * period, duration))
+            if goal is None:
+                return
+            self.cycle(goal, due, phase)
+            late = (clock.now() - start) / period
+            following = max(k + 1, ceil(late - 1e-9))
+            self.log.skipped += following - k - 1
+            k = following
+
+    def cycle(self, goal: Array, due: float, phase: Phase) -> None:
+        """Write one goal to all servos, read all of them, look for faults."""
+        driver, log = self.driver, self.log
+        begun = driver.clock.now()
+        goal = self._limit(goal, begun)
+        counts = self._counts(goal)
+        driver.sync_write(self.rig.ids, "goal_position", counts.astype(int).tolist())
+        self.goal, self._last = goal, begun
+        self._sent.append(counts)
+        rest = due + self.period - driver.clock.now()
+        replies = driver.read_block(self.ready.block, retries=1 if rest > 2 * self._cost else 0)
+        feedback = self.ready.block.decode(replies)
+        log.due.append(due)
+        log.begun.append(begun)
+        log.ended.append(driver.clock.now())
+        log.phase.append(phase)
+        log.goal.append(goal)
+        log.feedback.append(feedback)
+        self._judge(feedback, replies, phase)
+        if driver.clock.now() >= self._health_due and due + self.period - driver.clock.now() > self._cost:
+            self._look_at_health(phase)
+
+    def _limit(self, goal: Array, now: float) -> Array:
+        """Software limits: inside of the range, and no further per cycle than the speed allows."""
+        if not np.all(np.isfinite(goal)):
+            id = self.rig.ids[int(np.argmin(np.isfinite(goal)))]
+            raise RigFault("stream", f"the goal of {self.rig.label(id)} is not a number", servo=id)
+        elapsed = min(max(now - self._last, self.period), PATIENCE * self.period)
+        step = self._speed * (_STEP_MARGIN * elapsed) + POSITION
+        wanted = goal
+        goal = np.minimum(np.maximum(goal, self._low), self._high)
+        goal = np.minimum(np.maximum(goal, self.goal - step), self.goal + step)
+        if np.max(np.abs(goal - wanted)) > POSITION:
+            self.log.clamped += 1
+        return goal
+
+    def _judge(self, feedback: Array, replies: dict[int, Reply], phase: Phase) -> None:
+        """RigFault for a servo that is lost, in error, without torque, tripped, stale or far behind."""
+        rig = self.rig
+        heard = ~np.isnan(feedback[:, _X])
+        self._silent = np.where(heard, 0, self._silent + 1)
+        self.present = np.where(heard, feedback[:, _X], self.present)
+        counts = np.rint(feedback[:, _GOAL] / POSITION) + CENTRE
+        stale = heard & (counts != self._sent[-1])
+        if stale.any():
+            self.log.lost_goals += 1
+        self._stale = np.where(heard, np.where(stale, self._stale + 1, 0), self._stale + 1)
+        self.log.oldest_goal = max(self.log.oldest_goal, int(self._stale.max()))
+        behind = heard & (np.abs(feedback[:, _X] - self.goal) > rig.following_error)
+        self._behind = np.where(behind, self._behind + 1, 0)
+        bad = (
+            heard & ((feedback[:, _ERROR] != 0) | (feedback[:, _TORQUE] != 1) | (feedback[:, _WATCHDOG] < 0))
+        ) | (np.maximum(np.maximum(self._silent, self._stale) - PATIENCE + LAGGING, self._behind) >= LAGGING)
+        if bad.any():
+            raise self._fault(int(np.argmax(bad)), feedback, phase)
+
+    def _fault(self, i: int, feedback: Array, phase: Phase) -> RigFault:
+        id = self.rig.ids[i]
+        label, row = self.rig.label(id), feedback[i]
+        if row[_ERROR] > 0:
+            text = f"{label} reports a hardware error: {error_names(int(row[_ERROR]))}; it needs a reboot"
+        elif row[_WATCHDOG] < 0:
+            text = f"the bus watchdog of {label} tripped: it heard nothing for {self.rig.watchdog:g} s"
+        elif row[_TORQUE] == 0:
+            text = f"{label} lost its torque: did its supply break down, or did somebody switch it off?"
+        elif self._silent[i] >= PATIENCE:
+            text = f"{label} has not answered for {self._silent[i]} cycles: is its cable in?"
+        elif self._stale[i] >= PATIENCE:
+            text = f"{label} has not taken a goal for {self._stale[i]} cycles"
+        else:
+            gap = abs(row[_X] - self.goal[i])
+            text = f"{label} is {gap:.3f} rad behind its goal: is something in its way?"
+        return RigFault(phase, text, servo=id)
+
+    def _look_at_health(self, phase: Phase) -> None:
+        """Voltage and temperature, about once a second, in the spare time of a cycle."""
+        self._health_due = self.driver.clock.now() + HEALTH_PERIOD
+        values = self._health.decode(self.driver.read_block(self._health, retries=0))
+        heard = values[~np.isnan(values[:, 0])]
+        if len(heard):
+            self.log.lowest_voltage = min(self.log.lowest_voltage, float(heard[:, 0].min()))
+            self.log.hottest = max(self.log.hottest, float(heard[:, 1].max()))
+        hot = np.nan_to_num(values[:, 1], nan=-np.inf) >= self._too_hot
+        if hot.any():
+            i = int(np.argmax(hot))
+            id = self.rig.ids[i]
+            raise RigFault(
+                phase,
+                f"{self.rig.label(id)} has {values[i, 1]:.0f} degC, close to the {self._too_hot[i] + _HOT:.0f} "
+                "at which it lets go: let it cool down",
+                servo=id,
+            )
