@@ -18,7 +18,8 @@ from ..models import load_model
 from ..models.naming import joint_names
 from ..sim.scene.load import locate
 from ..sim.scene.mistakes import Mistake, Path_, report
-from ..sim.scene.schema import Finite, Item, Positive
+from ..sim.scene.schema import Item
+from ..sim.scene.values import Finite, Positive
 from .errors import HardwareError, RegisterError, unknown
 from .registers import control_table, model_names
 

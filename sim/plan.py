@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 
 from ..models import name_of
+from .compose import make_law
 from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
-from .errors import SceneError
-from .scene.build import Setup, build
-from .scene.mistakes import Mistake, report
+from .errors import SceneError, unknown
+from .scene.build import Setup, build, resolve
+from .scene.mistakes import Mistake, SceneMistakes, report
 from .scene.schema import Scene
 
 _DEFAULT_PERIOD = 0.002  # s; period of the controller of tracked joints when the scene names none
@@ -58,9 +59,24 @@ def make_plan(scene: Scene) -> Plan:
     return plan_setup(build(scene))
 
 
+def check(scene: Scene) -> list[Mistake]:
+    """All mistakes of a well-formed scene: those that need its models to be seen, and those of its plan."""
+    setup, mistakes = resolve(scene)
+    if setup is None:
+        return mistakes + _solver(scene)
+    try:
+        plan_setup(setup)
+    except SceneMistakes as e:
+        return list(e.mistakes)
+    return []
+
+
 def plan_setup(setup: Setup) -> Plan:
-    """Plan of a scene that is resolved already."""
+    """Plan of a scene that is resolved already. Raises SceneError for what no engine can do."""
     scene, model = setup.scene, setup.model
+    mistakes = _solver(scene) + _misfits(setup)
+    if mistakes:
+        raise report(mistakes, scene._file, scene._lines)
     engine = _engine(setup)
     touch = can_touch(model)
     period = _period(setup)
@@ -79,6 +95,8 @@ def plan_setup(setup: Setup) -> Plan:
         servo=setup.servo,
         wrenches=setup.wrenches,
     )
+    if mistakes := _law(problem, scene):
+        raise report(mistakes, scene._file, scene._lines)
     return Plan(
         setup,
         engine,
@@ -91,26 +109,67 @@ def plan_setup(setup: Setup) -> Plan:
     )
 
 
-def _fail(setup: Setup, path: tuple[str | int, ...], message: str) -> SceneError:
-    return report([Mistake(path, message)], setup.scene._file, setup.scene._lines)
+def _solver(scene: Scene) -> list[Mistake]:
+    """Choices of the solver that no engine offers."""
+    solver, mistakes = scene.solver, []
+    if solver.engine == "smooth":
+        message = "this version has no smooth engine; it has: kinematic, contact"
+        mistakes.append(Mistake(("solver", "engine"), message))
+    if solver.integrator not in ("auto", *INTEGRATORS):
+        message = unknown("integrator", solver.integrator, ("auto", *INTEGRATORS), where="the contact engine")
+        mistakes.append(Mistake(("solver", "integrator"), message))
+    if solver.tolerance is not None:
+        message = "no integrator of the contact engine is adaptive; use 'step'"
+        mistakes.append(Mistake(("solver", "tolerance"), message))
+    if solver.step != "auto" and solver.step > scene.duration:
+        message = f"a step of {solver.step:g} s is longer than the scene, {scene.duration:g} s"
+        mistakes.append(Mistake(("solver", "step"), message))
+    return mistakes
+
+
+def _misfits(setup: Setup) -> list[Mistake]:
+    """Choices of the solver and the controller that do not fit the joints or each other."""
+    scene, mistakes = setup.scene, []
+    engine, step, period = scene.solver.engine, scene.solver.step, _period(setup)
+    free = _moved_by_physics(setup)
+    if engine == "kinematic" and free:
+        shown = ", ".join(free[:8]) + (", ..." if len(free) > 8 else "")
+        message = f'needs keys on every joint; without keys: {shown}. Use engine = "auto"'
+        message = f"the kinematic engine {message}"
+        mistakes.append(Mistake(("solver", "engine"), message, needs=("keys", "roles")))
+    if step != "auto" and period is not None and free and not _whole(period / step):
+        tries = sorted({period / max(1, np.floor(period / step)), period / np.ceil(period / step)})
+        message = (
+            f"the controller's period {period:g} s is no whole multiple of the step {step:g} s; "
+            f"try a step of {' or '.join(f'{h:.6g} s' for h in tries)}"
+        )
+        mistakes.append(Mistake(("controller", "period"), message))
+    return mistakes
+
+
+def _law(problem: Problem, scene: Scene) -> list[Mistake]:
+    """What the controller's law finds wrong in its parameters."""
+    if scene.controller is None:
+        return []
+    try:
+        make_law(scene.controller.law, problem, scene.controller.parameters)
+    except SceneError as e:
+        return [Mistake(("controller",), str(e))]
+    return []
+
+
+def _moved_by_physics(setup: Setup) -> list[str]:
+    return [name_of(setup.model, "joint", int(j)) for j in np.flatnonzero(setup.roles != Role.KEYED)]
+
+
+def _whole(ratio: float) -> bool:
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-6
 
 
 def _engine(setup: Setup) -> Choice:
-    asked = setup.scene.solver.engine
-    free = [name_of(setup.model, "joint", int(j)) for j in np.flatnonzero(setup.roles != Role.KEYED)]
-    if asked == "kinematic" and free:
-        shown = ", ".join(free[:8]) + (", ..." if len(free) > 8 else "")
-        raise _fail(
-            setup,
-            ("solver", "engine"),
-            f'the kinematic engine needs keys on every joint; without keys: {shown}. Use engine = "auto"',
-        )
-    if asked == "smooth":
-        raise _fail(
-            setup, ("solver", "engine"), "this version has no smooth engine; it has: kinematic, contact"
-        )
-    if asked != "auto":
-        return Choice(asked, "the scene asks for it")
+    if setup.scene.solver.engine != "auto":
+        return Choice(setup.scene.solver.engine, "the scene asks for it")
+    free = _moved_by_physics(setup)
     if not free:
         return Choice("kinematic", "every joint is keyed, so no dynamics is needed")
     count = "one joint moves" if len(free) == 1 else f"{len(free)} joints move"
@@ -128,43 +187,35 @@ def _period(setup: Setup) -> float | None:
 
 
 def _step(setup: Setup, engine: str, period: float | None) -> tuple[float, Choice]:
-    asked, model = setup.scene.solver.step, setup.model
+    duration = setup.scene.duration
     if engine == "kinematic":
-        n = max(1, round(setup.scene.duration * setup.scene.rate))
-        h = setup.scene.duration / n
+        n = max(1, round(duration * setup.scene.rate))
+        h = duration / n
         return h, Choice(f"{h:.6g} s", f"keys are only looked up, {setup.scene.rate:g} times a second")
-    if asked != "auto":
-        if period is not None:
-            ratio = period / asked
-            if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
-                raise _fail(
-                    setup,
-                    ("controller", "period"),
-                    f"the controller's period {period:g} s is no whole multiple of the step {asked:g} s; "
-                    f"try {period / max(1, np.floor(ratio)):.6g} s or {period / np.ceil(ratio):.6g} s",
-                )
-        return asked, Choice(f"{asked:g} s", "the scene asks for it")
-    h = float(model.opt.timestep)
-    if period is None:
-        return h, Choice(f"{h:g} s", "the model file says so")
-    fitted = period / np.ceil(period / h - 1e-9)
-    why = "the model file says so" if abs(fitted - h) < 1e-12 else f"the model's {h:g} s fitted to the period"
-    return float(fitted), Choice(f"{fitted:.6g} s", f"{why}; {round(period / fitted)} a controller period")
+    own = float(setup.model.opt.timestep)
+    if setup.scene.solver.step != "auto":
+        h, why = setup.scene.solver.step, "the scene asks for it"
+    elif period is not None:
+        h = float(period / np.ceil(period / min(own, duration) - 1e-9))
+        why = "the model file says so" if _same(h, own) else f"the model's {own:g} s fitted to the period"
+        why += f"; {round(period / h)} a controller period"
+    else:
+        h = float(duration / np.ceil(duration / own - 1e-6))
+        why = "the model file says so" if _same(h, own) else f"the model's {own:g} s fitted to the duration"
+    if not _whole(duration / h):
+        why += f"; the run ends after whole steps, at {round(duration / h) * h:.6g} s"
+    return (own if _same(h, own) else h), Choice(f"{h:.6g} s", why)
+
+
+def _same(h1: float, h2: float) -> bool:
+    return abs(h1 - h2) <= 1e-6 * h2
 
 
 def _integrator(setup: Setup, engine: str, touch: bool, h: float) -> Choice:
     asked = setup.scene.solver.integrator
     if engine == "kinematic":
         return Choice("none", "nothing is integrated")
-    if setup.scene.solver.tolerance is not None:
-        raise _fail(
-            setup, ("solver", "tolerance"), "no integrator of the contact engine is adaptive; use 'step'"
-        )
     if asked != "auto":
-        if asked not in INTEGRATORS:
-            listing = ", ".join(sorted(INTEGRATORS))
-            message = f"the contact engine has no integrator {asked!r}; it has: {listing}"
-            raise _fail(setup, ("solver", "integrator"), message)
         return Choice(asked, "the scene asks for it")
     fastest = fastest_rate(setup)
     if fastest * h > 1.0:
@@ -244,6 +295,8 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
     elif (setup.roles == Role.KEYED).any():
         out.append("what pushes keyed joints: they cannot yield; the force their drive needs is recorded")
     idle = [name_of(setup.model, "actuator", int(i)) for i in np.flatnonzero(setup.drives == Drive.OFF)]
+    if scene.controller is not None and _period(setup) is None:
+        out.append("the controller: no joint is tracked by it and no actuator driven by it")
     if idle:
         out.append(f"actuators that nothing drives: {', '.join(idle)}")
     return out
@@ -257,7 +310,7 @@ def _cheaper(setup: Setup, engine: str, integrator: str, touch: bool) -> list[st
             "and lets RK4 reach order 4"
         )
     if engine == "contact" and touch and integrator == "rk4":
-        out.append("integrator = \"discrete\" needs one evaluation a step instead of four, at order 1")
+        out.append('integrator = "discrete" needs one evaluation a step instead of four, at order 1')
     if engine == "contact" and setup.scene.solver.step != "auto":
         h, own = float(setup.scene.solver.step), float(setup.model.opt.timestep)
         if h < own:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models import chain, load_spec
-from ..errors import ModelError
+from ..errors import ModelError, unknown
 from .mistakes import Mistake
 from .schema import ModelItem, Placement, PropItem, Scene
 
@@ -175,16 +175,7 @@ def apply_contacts(spec: mujoco.MjSpec, model: mujoco.MjModel, scene: Scene) -> 
         for j, name in enumerate(names):
             geoms = _geoms_of(model, name)
             if not geoms:
-                known = sorted(
-                    {model.body(b).name for b in range(model.nbody)}
-                    | {model.geom(g).name for g in range(model.ngeom)}
-                )
-                mistakes.append(
-                    Mistake(
-                        ("physics", "contacts", i, j),
-                        f"no body or geom {name!r} that could touch; there is: {', '.join(known)}",
-                    )
-                )
+                mistakes.append(Mistake(("physics", "contacts", i, j), _untouchable(model, name)))
             sides.append(geoms)
         pairs |= {(min(a, b), max(a, b)) for a in sides[0] for b in sides[1] if a != b}
     shapes = list(spec.geoms)
@@ -216,6 +207,17 @@ def _geoms_of(model: mujoco.MjModel, name: str) -> list[int]:
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         found = range(geom, geom + 1) if geom >= 0 else range(0)
     return [g for g in found if model.geom_contype[g] or model.geom_conaffinity[g]]
+
+
+def _untouchable(model: mujoco.MjModel, name: str) -> str:
+    """Why nothing can touch a body or geom of this name."""
+    names = {model.body(b).name for b in range(model.nbody)} | {
+        model.geom(g).name for g in range(model.ngeom)
+    }
+    touching = [n for n in names if _geoms_of(model, n)]
+    if name not in names:
+        return unknown("body or geom", name, touching, where="of those that can touch, the scene")
+    return f"{name!r} has no geom that can touch; these have: {', '.join(sorted(touching)) or 'none'}"
 
 
 def exclude_prescribed(spec: mujoco.MjSpec, model: mujoco.MjModel, prescribed: NDArray[np.bool_]) -> None:

@@ -46,18 +46,14 @@ class Setup:
 
 def build(scene: Scene) -> Setup:
     """Resolve a scene. Raises SceneError with all its mistakes."""
-    setup, mistakes = _resolve(scene)
+    setup, mistakes = resolve(scene)
     if mistakes or setup is None:
         raise report(mistakes, scene._file, scene._lines)
     return setup
 
 
-def check(scene: Scene) -> list[Mistake]:
-    """Mistakes that need the models to be seen."""
-    return _resolve(scene)[1]
-
-
-def _resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
+def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
+    """A scene resolved against its models, and its mistakes; None when there are any."""
     spec, mistakes = assemble(scene)
     if spec is None:
         return None, mistakes + _law(scene)
@@ -104,11 +100,15 @@ def _law(scene: Scene) -> list[Mistake]:
 
     if scene.controller is None:
         return []
-    try:
-        check_law(scene.controller.law, scene.controller.parameters)
-    except SceneError as e:
-        return [Mistake(("controller",), str(e))]
-    return []
+    mistakes, law = [], scene.controller.law
+    for words in [{}, *({word: value} for word, value in scene.controller.parameters.items())]:
+        try:
+            check_law(law, words)
+        except SceneError as e:
+            mistakes.append(Mistake(("controller", *(words or ("law",))), str(e)))
+            if not words:
+                break
+    return mistakes
 
 
 def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[np.int8], list[Mistake]]:
@@ -136,7 +136,7 @@ def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[
         if int(keyed) not in found.tracks:
             name = name_of(model, "joint", int(keyed))
             message = f"joint {name!r} is keyed but has no keys; add [[keys]] joint = {name!r}"
-            mistakes.append(Mistake(("roles", "keyed"), message))
+            mistakes.append(Mistake(("roles", "keyed"), message, needs=("keys",)))
     return roles, mistakes
 
 
@@ -164,7 +164,10 @@ def _initial(scene: Scene, model: mujoco.MjModel) -> tuple[State, list[Mistake]]
             row = np.atleast_1d(np.asarray(value, dtype=float))
             width = _width(model, joint, word)
             if len(row) != width:
-                mistakes.append(Mistake(path, f"needs {width} number{'s' * (width > 1)}, got {len(row)}"))
+                mistakes.append(Mistake(path, _wrong_width(model, joint, word, len(row))))
+                continue
+            if word == "position" and width >= 4 and not row[-4:].any():
+                mistakes.append(Mistake(path, "the zero quaternion is no rotation; 1, 0, 0, 0 turns nothing"))
                 continue
             if scene.angle == "degree" and model.jnt_type[joint] == HINGE:
                 row = np.deg2rad(row)
@@ -176,6 +179,14 @@ def _initial(scene: Scene, model: mujoco.MjModel) -> tuple[State, list[Mistake]]
 def _width(model: mujoco.MjModel, joint: int, word: str) -> int:
     position, velocity = {FREE: (7, 6), BALL: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
     return position if word == "position" else velocity
+
+
+def _wrong_width(model: mujoco.MjModel, joint: int, word: str, got: int) -> str:
+    kind, width = int(model.jnt_type[joint]), _width(model, joint, word)
+    angular = "qw, qx, qy, qz" if word == "position" else "wx, wy, wz"
+    meaning = {FREE: f" (x, y, z, {angular})", BALL: f" ({angular})"}.get(kind, "")
+    name = {FREE: "free", BALL: "ball", HINGE: "hinge"}.get(kind, "slide")
+    return f"a {name} joint's {word} is {width} number{'s' * (width > 1)}{meaning}, got {got}"
 
 
 def _start_on_keys(scene: Scene, model: mujoco.MjModel, clip: Clip, state0: State) -> State:
@@ -247,7 +258,7 @@ def _drives(
                 servo[i] = _servo_along_keys(model, clip, i)
         else:
             message = f"actuator {name!r} is driven by keys but has none: add [[keys]] actuator = {name!r}"
-            mistakes.append(Mistake(path, message))
+            mistakes.append(Mistake(path, message, needs=("keys",)))
     return drives, servo, mistakes
 
 
@@ -335,5 +346,6 @@ def _film_names(scene: Scene, model: mujoco.MjModel) -> list[Mistake]:
     known = {c.name for c in scene.cameras} | set(cameras.ids)
     if scene.film.camera is not None and scene.film.camera not in known:
         listing = ", ".join(sorted(known)) or "none"
-        mistakes.append(Mistake(("film", "camera"), f"no camera {scene.film.camera!r}; there is: {listing}"))
+        message = f"no camera {scene.film.camera!r}; there is: {listing}"
+        mistakes.append(Mistake(("film", "camera"), message, needs=("cameras",)))
     return mistakes

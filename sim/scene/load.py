@@ -8,11 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from ..errors import SceneError
-from .build import check
-from .mistakes import Mistake, Path_, report
+from ..plan import check
+from .mistakes import Mistake, Path_, SceneMistakes, report
 from .schema import Scene
 
 _NAME = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
@@ -29,7 +27,7 @@ def load_scene(path: str | Path) -> Scene:
     """
     path = Path(path)
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         folder = path.parent if path.parent.is_dir() else Path.cwd()
         near = ", ".join(sorted(p.name for p in folder.glob("*.toml"))) or "no .toml file"
@@ -48,66 +46,60 @@ def parse_scene(text: str, *, file: str = "scene", base: Path | None = None) -> 
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as e:
-        raise SceneError(f"{file}: not valid TOML: {e}") from None
+        raise SceneError(f"{file}: {_syntax(str(e), text)}") from None
     lines = locate(text)
     scene, mistakes, moved = _validate(data)
     if scene is not None:
         scene._base, scene._lines, scene._file = base, lines, file
+        malformed = {str(m.path[0]) for m in mistakes if m.path}
         for m in check(scene):
             index = moved.get(m.path[:2])
-            mistakes.append(m if index is None else Mistake((m.path[0], index, *m.path[2:]), m.message))
+            path = m.path if index is None else (m.path[0], index, *m.path[2:])
+            if not malformed.intersection(m.needs):
+                mistakes.append(Mistake(path, m.message))
     if mistakes:
         raise report(mistakes, file, lines)
     assert scene is not None
     return scene
 
 
+def _syntax(message: str, text: str) -> str:
+    """What the parser says, with the line that it means."""
+    found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", message, re.DOTALL)
+    if found is None:
+        return f"not valid TOML: {message}"
+    said, lines = found[1][0].lower() + found[1][1:], text.split("\n")
+    if found[2] is None:
+        return f"not valid TOML at the end of the file: {said}"
+    number = int(found[2])
+    return f"line {number}, column {found[3]}, not valid TOML: {said}\n  {lines[number - 1].strip()}"
+
+
 def _validate(data: dict[str, Any]) -> tuple[Scene | None, list[Mistake], dict[Path_, int]]:
     """The scene less its malformed items, their mistakes, and (list, new index) -> index in the file."""
     try:
         return Scene(**data), [], {}
-    except ValidationError as e:
-        mistakes = [Mistake(_path(err["loc"]), _say(err)) for err in e.errors()]
-    bad = {
-        m.path[:2] if m.path and isinstance(data.get(str(m.path[0])), list) else m.path[:1] for m in mistakes
-    }
-    pruned: dict[str, Any] = {"duration": 1.0}
+    except SceneMistakes as e:
+        mistakes = list(e.mistakes)
+    bad = {m.path[:2] for m in mistakes}
+    pruned: dict[str, Any] = {}
     moved: dict[Path_, int] = {}
     for key, value in data.items():
         if isinstance(value, list):
             kept = [i for i in range(len(value)) if (key, i) not in bad]
             pruned[key] = [value[i] for i in kept]
             moved |= {(key, new): old for new, old in enumerate(kept)}
-        elif (key,) not in bad:
-            pruned[key] = value
+        else:
+            tables = isinstance(value, dict)
+            pruned[key] = {k: v for k, v in value.items() if (key, k) not in bad} if tables else value
+    pruned = {k: v for k, v in pruned.items() if k in Scene.model_fields and (k,) not in bad}
     # names cannot be checked against models that are not there
     if any(b[:1] in ((), ("models",), ("props",)) for b in bad):
         return None, mistakes, moved
     try:
-        return Scene(**pruned), mistakes, moved
-    except ValidationError:
+        return Scene(**{"duration": 1.0, **pruned}), mistakes, moved
+    except SceneMistakes:
         return None, mistakes, moved
-
-
-def _path(loc: tuple[str | int, ...]) -> Path_:
-    """Pydantic's location without the names of union members and types, which are not in the file."""
-    return tuple(p for p in loc if isinstance(p, int) or (re.fullmatch(r"[a-z_]+", p) and p not in _MEMBERS))
-
-
-_MEMBERS = {"float", "int", "bool", "str", "auto", "model", "none", "constrained-float"}
-
-
-def _say(error: Any) -> str:
-    """Pydantic's finding in a person's words, with what was given."""
-    kind, given = error["type"], error.get("input")
-    if kind == "extra_forbidden":
-        return "there is no such word here; 'pantograph schema' lists them"
-    if kind == "missing":
-        return "is missing"
-    if kind == "value_error":
-        return str(error["ctx"]["error"])
-    shown = repr(given) if not isinstance(given, dict | list) or len(repr(given)) < 60 else "what is given"
-    return f"{error['msg'][0].lower()}{error['msg'][1:]}, got {shown}"
 
 
 def locate(text: str) -> dict[Path_, int]:
@@ -116,7 +108,7 @@ def locate(text: str) -> dict[Path_, int]:
     counts: dict[Path_, int] = {}
     table: Path_ = ()
     depth, fence = 0, ""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if fence:
             if fence in line:
                 fence = ""
@@ -130,16 +122,22 @@ def locate(text: str) -> dict[Path_, int]:
                     plain = _names(header[2])
                     counts[plain] = counts.get(plain, -1) + 1
                     table = (*(table[:-1] if isinstance(table[-1], int) else table), counts[plain])
-                lines.setdefault(table, number)
+                _note(lines, table, number)
                 continue
             if key := _KEY.match(line):
-                lines.setdefault((*table, *_names(key[1])), number)
+                _note(lines, (*table, *_names(key[1])), number)
         bare = _STRING.sub("", line)
         for quotes in ('"""', "'''"):
             if bare.count(quotes) % 2 or line.count(quotes) % 2:
                 fence = quotes
         depth = max(0, depth + sum(bare.count(c) for c in "[{") - sum(bare.count(c) for c in "]}"))
     return lines
+
+
+def _note(lines: dict[Path_, int], path: Path_, number: int) -> None:
+    """A path and the tables that it opens on its way are first seen on a line."""
+    for i in range(1, len(path) + 1):
+        lines.setdefault(path[:i], number)
 
 
 def _names(dotted: str) -> Path_:

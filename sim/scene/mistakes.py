@@ -12,10 +12,23 @@ Path_ = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class Mistake:
-    """One thing wrong in a scene: where (path into the scene) and what."""
+    """One thing wrong in a scene: where (path into the scene) and what.
+
+    ``needs`` names parts of the scene: if items of these were left out for mistakes of their own, this one
+    may only follow from that.
+    """
 
     path: Path_
     message: str
+    needs: tuple[str, ...] = ()
+
+
+class SceneMistakes(SceneError):
+    """A scene with mistakes, and these one by one."""
+
+    def __init__(self, text: str, mistakes: tuple[Mistake, ...]) -> None:
+        super().__init__(text)
+        self.mistakes = mistakes
 
 
 def place(path: Path_) -> str:
@@ -26,7 +39,7 @@ def place(path: Path_) -> str:
     return out or "scene"
 
 
-def report(mistakes: Iterable[Mistake], scene_file: str, lines: Mapping[Path_, int]) -> SceneError:
+def report(mistakes: Iterable[Mistake], scene_file: str, lines: Mapping[Path_, int]) -> SceneMistakes:
     """All mistakes as one error, in the order of the file."""
 
     def line(path: Path_) -> int:
@@ -39,6 +52,7 @@ def report(mistakes: Iterable[Mistake], scene_file: str, lines: Mapping[Path_, i
     rows = []
     for m in ordered:
         at = f"line {line(m.path)}, " if line(m.path) else ""
-        rows.append(f"  {at}{place(m.path)}: {m.message}")
+        message = m.message.replace("\n", "\n    ")
+        rows.append(f"  {at}{place(m.path)}: {message}")
     count = "1 mistake" if len(rows) == 1 else f"{len(rows)} mistakes"
-    return SceneError(f"{scene_file}: {count}\n" + "\n".join(rows))
+    return SceneMistakes(f"{scene_file}: {count}\n" + "\n".join(rows), tuple(ordered))

@@ -49,9 +49,10 @@ def curves(scene: Scene, model: mujoco.MjModel) -> tuple[Curves, list[Mistake]]:
             else:
                 _film(item, scene, out)
         except _At as e:
-            mistakes.append(Mistake(("keys", i, e.word), e.message))
+            where = ("keys", i, e.word) if e.word else ("keys", i)
+            mistakes.append(Mistake(where, e.message, needs=(f"{e.word}s",)))
         except PantographError as e:
-            mistakes.append(Mistake(("keys", i), str(e)))
+            mistakes.append(Mistake(("keys", i, "values"), str(e)))
     for joint, channels in parts.items():
         free = model.jnt_type[joint] == FREE
         out.tracks[joint] = FreeTrack(**channels) if free else next(iter(channels.values()))
@@ -67,7 +68,7 @@ class _At(Exception):
 
 def _once(curves: dict[Any, Curve], key: Any, curve: Curve) -> None:
     if key in curves:
-        raise _At("times", "these keys name a channel that has keys already; put them into one item")
+        raise _At("", "this channel has keys already; put them all into one [[keys]]")
     curves[key] = curve
 
 
@@ -121,7 +122,8 @@ def _rotations(item: KeysItem, scene: Scene) -> Curve:
         angles = np.deg2rad(rows) if scene.angle == "degree" else rows
         rows = from_euler("xyz", angles)
     if rows.shape[1] != 4:
-        raise _At("values", f"a rotation is w, x, y, z or euler x, y, z; got {rows.shape[1]} numbers")
+        got = f"{rows.shape[1]} number{'s' * (rows.shape[1] > 1)}"
+        raise _At("values", f"a rotation is w, x, y, z or euler x, y, z; got {got}")
     return keyed_rotation(
         item.times, rows, kind=item.curve, ease=item.ease, before=item.before, after=item.after
     )

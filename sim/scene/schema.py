@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Vector = tuple[Finite, Finite, Finite]
-Quaternion = tuple[Finite, Finite, Finite, Finite]
-Colour = tuple[Finite, Finite, Finite] | tuple[Finite, Finite, Finite, Finite]
-Row = Finite | list[Finite]
+from ..curves import check_kind
+from ..errors import KeyingError
+from .mistakes import report
+from .values import Colour, Finite, NotNegative, Pair, Positive, Quaternion, Row, Switch, Vector, at, plain
+from .words import mistakes_of
+
 Curve = Literal["step", "linear", "auto", "natural", "clamped"]
 
 
@@ -20,6 +30,11 @@ class Item(BaseModel):
     """Base of every table of a scene: unknown words are mistakes, values do not change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _plain(cls, value: Any) -> Any:
+        return plain(value)
 
 
 class Placement(Item):
@@ -32,9 +47,9 @@ class Placement(Item):
     @model_validator(mode="after")
     def _one_rotation(self) -> Placement:
         if self.rotation is not None and self.euler is not None:
-            raise ValueError("give 'rotation' (quaternion) or 'euler', not both")
+            raise at("euler", message="give 'rotation' (quaternion) or 'euler', not both")
         if self.rotation is not None and sum(c * c for c in self.rotation) < 1e-12:
-            raise ValueError("'rotation' is the zero quaternion; no rotation is [1, 0, 0, 0]")
+            raise at("rotation", message="the zero quaternion is no rotation; [1, 0, 0, 0] turns nothing")
         return self
 
 
@@ -46,10 +61,10 @@ class ChainItem(Item):
     mass: Positive = Field(1.0, description="of the whole chain, kg")
     joint: Literal["ball", "hinge"] = "ball"
     radius: Positive | None = Field(None, description="of the links, metres")
-    damping: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="N m s/rad")
-    fixed: bool = Field(True, description="hangs from the world; otherwise it is loose")
-    point_masses: bool = False
-    contacts: bool = Field(False, description="links touch other things")
+    damping: NotNegative = Field(0.0, description="N m s/rad")
+    fixed: Switch = Field(True, description="hangs from the world; otherwise it is loose")
+    point_masses: Switch = False
+    contacts: Switch = Field(False, description="links touch other things")
 
 
 class ModelItem(Placement):
@@ -64,7 +79,7 @@ class ModelItem(Placement):
     @model_validator(mode="after")
     def _one_source(self) -> ModelItem:
         if (self.file is None) == (self.chain is None):
-            raise ValueError("give 'file' or 'chain', one of them")
+            raise at(message="give 'file' or 'chain', one of them")
         return self
 
 
@@ -80,17 +95,18 @@ class PropItem(Placement):
     mass: Positive | None = Field(None, description="kg; default from the density of water")
     color: Colour = (0.7, 0.7, 0.75)
     friction: Positive | None = Field(None, description="sliding friction coefficient")
-    fixed: bool = False
+    fixed: Switch = False
 
     @model_validator(mode="after")
     def _sizes(self) -> PropItem:
         need = {"plane": 2, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0}
         if len(self.size) != need[self.shape]:
-            raise ValueError(f"a {self.shape} needs {need[self.shape]} sizes, got {len(self.size)}")
+            count = f"{need[self.shape]} size{'s' * (need[self.shape] != 1)}"
+            raise at("size", message=f"a {self.shape} needs {count}, got {len(self.size)}")
         if (self.shape == "mesh") != (self.file is not None):
-            raise ValueError("'file' belongs to shape 'mesh', and a mesh needs it")
+            raise at("file", message="shape 'mesh' needs a 'file', and no other shape has one")
         if self.shape == "plane" and not self.fixed:
-            raise ValueError("a plane must be fixed: fixed = true")
+            raise at("fixed", message="a plane must be fixed: fixed = true")
         return self
 
 
@@ -133,7 +149,8 @@ class KeysItem(Item):
     def _one_target(self) -> KeysItem:
         given = [k for k in ("joint", "actuator", "camera", "light") if getattr(self, k) is not None]
         if len(given) != 1:
-            raise ValueError(f"keys name one of joint, actuator, camera, light; got {given or 'none'}")
+            got = " and ".join(given) or "none"
+            raise at(message=f"keys name one of joint, actuator, camera, light; got {got}")
         allowed = {
             "joint": ("value", "position", "rotation"),
             "actuator": ("value",),
@@ -141,17 +158,27 @@ class KeysItem(Item):
             "light": ("position", "target", "intensity", "color"),
         }[given[0]]
         if self.channel is None and given[0] in ("camera", "light"):
-            raise ValueError(f"keys of a {given[0]} need a channel: {', '.join(allowed)}")
+            raise at(message=f"keys of a {given[0]} need a channel: {', '.join(allowed)}")
         if self.channel is not None and self.channel not in allowed:
-            raise ValueError(f"a {given[0]} has no channel {self.channel!r}; it has: {', '.join(allowed)}")
+            message = f"a {given[0]} has no channel {self.channel!r}; it has: {', '.join(allowed)}"
+            raise at("channel", message=message)
         if len(self.times) != len(self.values):
-            raise ValueError(f"{len(self.times)} times but {len(self.values)} values; give one value a time")
-        for t0, t1 in zip(self.times, self.times[1:], strict=False):
-            if t1 <= t0:
-                raise ValueError(f"times must ascend: {t1:g} follows {t0:g}")
+            message = f"{len(self.times)} times but {len(self.values)} values; give one value a time"
+            raise at("values", message=message)
+        _ascending(self.times)
         if len({len(r) if isinstance(r, list) else 0 for r in self.values}) > 1:
-            raise ValueError("values differ in length; every row needs the same number of components")
+            raise at("values", message="every value needs the same number of components")
+        try:
+            check_kind(self.curve, self.ease, self.before, self.after)
+        except KeyingError as e:
+            raise at("ease", message=str(e)) from None
         return self
+
+
+def _ascending(times: list[float]) -> None:
+    for t0, t1 in pairwise(times):
+        if t1 <= t0:
+            raise at("times", message=f"times must ascend: {t1:g} follows {t0:g}")
 
 
 class ForceItem(Item):
@@ -161,7 +188,7 @@ class ForceItem(Item):
     force: Vector | list[Vector] | None = Field(None, description="newtons: one vector, or one a time")
     torque: Vector | list[Vector] | None = Field(None, description="newton metres")
     frame: Literal["world", "body"] = "world"
-    times: list[Finite] | None = Field(None, description="seconds, for vectors over time")
+    times: list[Finite] | None = Field(None, min_length=1, description="seconds, for vectors over time")
     curve: Curve = "linear"
     start: Finite | None = Field(None, description="constant vectors: first moment, seconds")
     stop: Finite | None = Field(None, description="constant vectors: end, seconds")
@@ -169,23 +196,23 @@ class ForceItem(Item):
     @model_validator(mode="after")
     def _shape(self) -> ForceItem:
         if self.force is None and self.torque is None:
-            raise ValueError("give a force, a torque or both")
+            raise at(message="give a force, a torque or both")
         for name in ("force", "torque"):
             value = getattr(self, name)
             if value is None:
                 continue
             over_time = isinstance(value, list)
             if over_time != (self.times is not None):
-                raise ValueError(f"{name}: one vector without 'times', or a list with as many 'times'")
+                raise at(name, message="give one vector without 'times', or a list with as many 'times'")
             if over_time and self.times is not None and len(value) != len(self.times):
-                raise ValueError(f"{name} has {len(value)} vectors for {len(self.times)} times")
+                raise at(name, message=f"{len(value)} vectors for {len(self.times)} times")
         if self.times is not None:
             if self.start is not None or self.stop is not None:
-                raise ValueError("'start' and 'stop' belong to constant vectors; use 'times' alone")
-            if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
-                raise ValueError("times must ascend")
+                word = "start" if self.start is not None else "stop"
+                raise at(word, message="'start' and 'stop' belong to constant vectors; use 'times' alone")
+            _ascending(self.times)
         if self.start is not None and self.stop is not None and self.stop <= self.start:
-            raise ValueError(f"stop ({self.stop:g}) must come after start ({self.start:g})")
+            raise at("stop", message=f"stop ({self.stop:g}) must come after start ({self.start:g})")
         return self
 
 
@@ -206,12 +233,12 @@ class ControllerItem(BaseModel):
 class Physics(Item):
     """What of the model's physics takes part; the default is what the model file says."""
 
-    contacts: Literal["model", "none"] | list[tuple[str, str]] = Field(
+    contacts: Literal["model", "none"] | list[Pair] = Field(
         "model", description="as the model file has them, none, or pairs of bodies or geoms"
     )
-    limits: bool = True
-    friction: bool = Field(True, description="dry friction of joints and tendons")
-    gravity: bool | Vector = True
+    limits: Switch = True
+    friction: Switch = Field(True, description="dry friction of joints and tendons")
+    gravity: Switch | Vector = True
 
 
 class Solver(Item):
@@ -235,12 +262,12 @@ class CameraItem(Item):
     elevation: Finite = Field(0.3, description="orbit: scene angles above the horizon")
     azimuth: Finite = Field(0.0, description="orbit: scene angles at t = 0")
     period: Positive | None = Field(None, description="orbit: seconds a turn")
-    fovy: Annotated[float, Field(gt=0, lt=180)] = Field(45.0, description="vertical field of view, degrees")
+    fovy: Positive = Field(45.0, lt=180, description="vertical field of view, degrees")
 
     @model_validator(mode="after")
     def _kind_needs(self) -> CameraItem:
         if self.kind == "tracking" and self.body is None:
-            raise ValueError("a tracking camera needs the 'body' to follow")
+            raise at(message="a tracking camera needs the 'body' to follow")
         return self
 
 
@@ -252,8 +279,8 @@ class LightItem(Item):
     position: Vector = (1.0, -1.0, 3.0)
     target: Vector = (0.0, 0.0, 0.0)
     color: Vector = (1.0, 1.0, 1.0)
-    intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
-    shadow: bool = True
+    intensity: NotNegative = 1.0
+    shadow: Switch = True
 
 
 class FilmItem(Item):
@@ -261,9 +288,9 @@ class FilmItem(Item):
 
     width: Annotated[int, Field(ge=16, le=7680)] = 640
     height: Annotated[int, Field(ge=16, le=4320)] = 480
-    fps: Annotated[float, Field(gt=0, le=1000)] = 30.0
+    fps: Positive = Field(30.0, le=1000)
     camera: str | None = Field(None, description="name of a camera; default frames the whole motion")
-    shadows: bool = True
+    shadows: Switch = True
 
 
 class Scene(Item):
@@ -294,22 +321,42 @@ class Scene(Item):
     _lines: dict[tuple[str | int, ...], int] = PrivateAttr(default_factory=dict)
     _file: str = PrivateAttr("scene")
 
+    @field_validator("format", mode="before")
+    @classmethod
+    def _known_format(cls, value: Any) -> Any:
+        if type(value) is int and value != 1:
+            raise at(message=f"this Pantograph reads format 1, not {value}; a newer one may read it")
+        return value
+
     @field_validator("models", "props", "cameras", "lights")
     @classmethod
     def _names_once(cls, items: list[Any]) -> list[Any]:
         names = [i.name for i in items]
-        twice = sorted({n for n in names if n is not None and names.count(n) > 1})
-        if twice:
-            raise ValueError(f"the name {twice[0]!r} is used twice")
-        if len(names) > 1 and None in names:
-            raise ValueError("with several models each needs a 'name'")
+        for i, name in enumerate(names):
+            if name in names[:i] and name is not None:
+                raise at(i, "name", message=f"the name {name!r} is used twice")
+            if name is None and len(names) > 1:
+                raise at(i, message="with several models each needs a 'name'")
         return items
 
     @model_validator(mode="after")
     def _not_empty(self) -> Scene:
         if not self.models and not self.props:
-            raise ValueError('a scene needs at least one model or prop: [[models]] file = "pendulum"')
+            raise at(message='a scene needs at least one model or prop: [[models]] file = "pendulum"')
         return self
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_words(cls, data: Any, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
+        """Raises SceneError, with all mistakes in a person's words, in place of pydantic's error."""
+        try:
+            return handler(data)
+        except ValidationError as e:
+            raise report(mistakes_of(e, data, cls), "scene", {}) from None
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same, wherever they come from."""
+        return isinstance(other, Scene) and self.model_dump() == other.model_dump()
 
     @property
     def base(self) -> Path:
