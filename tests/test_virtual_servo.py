@@ -136,6 +136,13 @@ def test_profile_of_the_registers(velocity, acceleration, goal):
     assert read(servo, "position_trajectory") == goal
 
 
+def test_velocity_limit_bounds_the_profile():
+    servo = ready(mode=4)
+    write(servo, "profile_velocity", 1000)
+    write(servo, "goal_position", 20_000)
+    assert read(servo, "velocity_trajectory") == read(servo, "velocity_limit") == 200
+
+
 def test_a_new_goal_keeps_the_velocity():
     servo = ready(mode=4)
     write(servo, "profile_velocity", 150)
@@ -248,6 +255,35 @@ def test_joints_of_one_simulation_advance_together():
     assert a.step(1e-3, 4.0) == (1, 1)
 
 
+def test_servos_feel_the_gravity_of_a_simulation():
+    """A pendulum in MuJoCo, held level: the current carries m g l but for what friction takes."""
+    import mujoco
+
+    motor = MOTORS["xm430-w350"]
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option timestep="1e-3" integrator="implicitfast"/><worldbody><body>
+          <joint axis="0 1 0" armature="{motor.inertia}" frictionloss="{motor.coulomb}"/>
+          <geom type="sphere" size="0.02" mass="0.5" pos="0.2 0 0"/>
+        </body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+
+    def step(dt, torques):
+        assert dt in (0.0, model.opt.timestep)
+        if dt:
+            data.qfrc_applied[:] = torques
+            mujoco.mj_step(model, data)
+        return data.qpos.copy(), data.qvel.copy()
+
+    (joint,) = joints(step, data.qpos.copy(), data.qvel.copy())
+    servo = VirtualServo("xm430-w350", plant=joint)
+    write(servo, "torque_enable", 1)
+    run(servo, 2.0)
+    torque, weight = motor.kt * servo.drive.current, 0.5 * 9.81 * 0.2 * np.cos(data.qpos[0])
+    assert abs(read(servo, "present_position") - 2048) < 60 and data.qpos[0] > 0.01
+    assert -torque == pytest.approx(weight, abs=1.05 * motor.coulomb)
+    assert servo.si("present_current") * motor.kt == pytest.approx(torque, abs=0.01)
+
+
 # Modes.
 
 
@@ -334,6 +370,17 @@ def test_clear_brings_back_into_one_turn_but_not_in_motion():
     assert read(servo, "present_position") == before - 2 * 4096
     run(servo, 1.0)
     assert read(servo, "present_position") == pytest.approx(before - 2 * 4096, abs=20)
+
+
+@pytest.mark.parametrize(("mode", "register", "limit"), [(0, "goal_current", 1193), (16, "goal_pwm", 885)])
+def test_effort_goals_stand_at_their_limits_or_not(mode, register, limit):
+    for is_open in (True, False):
+        servo = VirtualServo("xm430-w350", quirks=Quirks(effort_goals_open=is_open))
+        write(servo, "operating_mode", mode)
+        write(servo, "torque_enable", 1)
+        assert read(servo, register) == (limit if is_open else 0)
+        run(servo, 0.2)
+        assert (abs(read(servo, "present_velocity")) > 50) == is_open
 
 
 def test_pwm_limits_every_mode():

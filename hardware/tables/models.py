@@ -94,7 +94,7 @@ MODELS: Mapping[str, Model] = MappingProxyType(
         "xm430-w350": _x(1020, "xm430-w350", velocity=200, current=(1193, 2.69 * _mA)),
         "xm430-w210": _x(1030, "xm430-w210", velocity=330, current=(1193, 2.69 * _mA)),
         "xm540-w270": _x(1120, "xm540-w270", velocity=128, current=(2047, 2.69 * _mA), external_ports=True),
-        "xm540-w150": _x(1130, "xm540-w150", velocity=None, current=(2047, 2.69 * _mA), external_ports=True),
+        "xm540-w150": _x(1130, "xm540-w150", velocity=230, current=(2047, 2.69 * _mA), external_ports=True),
         "xh430-w350": _x(
             1000, "xh430-w350", velocity=130, position_gains=(0, 0, 900), current=(648, 2.69 * _mA)
         ),

@@ -23,6 +23,8 @@ def settings(memory: Memory, *, reverse: bool) -> Settings:
     get, table = memory.get, memory.table
     timed = bool(get("drive_mode") & 4)
     speed, acceleration = get("profile_velocity"), get("profile_acceleration")
+    if not timed:  # manual: Velocity Limit bounds Profile Velocity too
+        speed = min(speed, get("velocity_limit"))
     return Settings(
         mode=get("operating_mode"),
         torque=bool(get("torque_enable")),

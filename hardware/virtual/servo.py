@@ -32,12 +32,16 @@ class Quirks:
     Args:
         goal_survives_torque_off: At torque-on the servo goes to the old goal (True, the dangerous case) or
             holds.
+        effort_goals_open: After power-on and a change of mode Goal PWM and Goal Current stand at their
+            limits in every mode, as the manual says: torque-on in PWM or current mode then runs at full
+            power. False: zero in the mode that they drive.
         goal_limit_error: Answer to a goal position outside of the position limits.
         boot_time: Silence after a reboot [s].
         overload_ratio, overload_time: Overload is this part of the stall current for this long [s].
     """
 
     goal_survives_torque_off: bool = True
+    effort_goals_open: bool = True
     goal_limit_error: StatusError = StatusError.DATA_LIMIT
     boot_time: float = 0.1
     overload_ratio: float = 0.8
@@ -46,6 +50,9 @@ class Quirks:
 
 class VirtualServo:
     """One servo on a virtual bus.
+
+    Kept but without effect: feedforward gains, PWM slope, acceleration limit, external ports, LED, protocol
+        type other than 2.0, and restoring RAM at startup.
 
     Args:
         model: Name or number of a model that has a control table.
@@ -236,11 +243,12 @@ class VirtualServo:
         self._fresh = -1.0
 
     def _default_goals(self) -> None:
-        """Goals after power-on or a change of mode: nothing moves, limits are open."""
+        """Goals after power-on or a change of mode: the position is the present one, limits are open."""
         memory, mode = self.memory, self.memory.get("operating_mode")
-        memory.put("goal_pwm", 0 if mode == d.PWM_MODE else memory.get("pwm_limit"))
+        shut = not self.quirks.effort_goals_open
+        memory.put("goal_pwm", 0 if shut and mode == d.PWM_MODE else memory.get("pwm_limit"))
         if self.table.has_current:
-            memory.put("goal_current", 0 if mode == d.CURRENT_MODE else memory.get("current_limit"))
+            memory.put("goal_current", 0 if shut and mode == d.CURRENT_MODE else memory.get("current_limit"))
         memory.put("goal_velocity", 0)
         memory.put("goal_position", counts(self.drive.position))
         self._apply_settings()
