@@ -54,6 +54,9 @@ def double(x: float) -> str:
     return "0x" + struct.pack(">d", float(x)).hex().upper()
 
 
+UNROLL = 16  # loops over at most so many scalars are written out
+
+
 class Emitter:
     """Writes instructions on `lanes` doubles at once; values are names of IR registers or literals."""
 
@@ -153,6 +156,28 @@ class Emitter:
         self.do(f"br label %{name}.head")
         self.lines.append(f"{name}.exit:")
 
+    def over(self, size: int) -> Iterator[str]:
+        """Indices 0 ... size - 1: written out when few, so that arrays can live in registers, else a loop."""
+        if size <= UNROLL:
+            yield from map(str, range(size))
+        else:
+            with self.loop(size) as i:
+                yield i
+
+    def cell(self) -> str:
+        """Memory for an integer, allocated at the function's entry."""
+        register = self.fresh()
+        self.lines.insert(0, f"  {register} = alloca i64, align 8")
+        return register
+
+    def get(self, cell: str) -> str:
+        """The integer in a cell."""
+        return self.emit(f"load i64, ptr {cell}, align 8")
+
+    def put(self, cell: str, value: str | int) -> None:
+        """Set the integer in a cell."""
+        self.do(f"store i64 {value}, ptr {cell}, align 8")
+
     @contextmanager
     def when(self, condition: str) -> Iterator[None]:
         """Instructions executed only if the i1 `condition` holds."""
@@ -225,7 +250,8 @@ def declarations(lanes: int) -> str:
     """Intrinsics that kernels on `lanes` may call."""
     e = Emitter(lanes)
     return "\n".join(
-        f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity)})" for name, arity in DECLARED.items()
+        f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity)})"
+        for name, arity in DECLARED.items()
     )
 
 

@@ -29,21 +29,22 @@ class Block:
 
     def gather(self, pointers: list[str], into: str, size: int) -> None:
         """The first `size` entries of every lane's row into `into`."""
-        if size:
-            with self.e.loop(size) as i:
-                target = self.e.element(into, i)
-                for lane, pointer in enumerate(pointers):
-                    x = self.e.emit(f"load double, ptr {self.e.element(pointer, i, 'double')}, align 8")
-                    self.e.do(f"store double {x}, ptr {self.e.element(target, lane, 'double')}, align 8")
+        e = self.e
+        for i in e.over(size):
+            x = "poison"
+            for lane, pointer in enumerate(pointers):
+                entry = e.emit(f"load double, ptr {e.element(pointer, i, 'double')}, align 8")
+                x = entry if e.lanes == 1 else e.emit(f"insertelement {e.V} {x}, double {entry}, i64 {lane}")
+            e.store(x, into, i)
 
     def scatter(self, source: str, pointers: list[str], size: int) -> None:
         """The first `size` scalars of `source` into every lane's row."""
-        if size:
-            with self.e.loop(size) as i:
-                start = self.e.element(source, i)
-                for lane, pointer in enumerate(pointers):
-                    x = self.e.emit(f"load double, ptr {self.e.element(start, lane, 'double')}, align 8")
-                    self.e.do(f"store double {x}, ptr {self.e.element(pointer, i, 'double')}, align 8")
+        e = self.e
+        for i in e.over(size):
+            x = e.load(source, i)
+            for lane, pointer in enumerate(pointers):
+                entry = x if e.lanes == 1 else e.emit(f"extractelement {e.V} {x}, i64 {lane}")
+                e.do(f"store double {entry}, ptr {e.element(pointer, i, 'double')}, align 8")
 
 
 def buffer(e: Emitter, size: int) -> str:

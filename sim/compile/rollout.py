@@ -32,11 +32,13 @@ class Method(Protocol):
 class Shape:
     """Sizes of what a compiled integration handles.
 
-    `quaternions` are first entries in x; `nr`, `ng` the sizes of a controller's reference rows and gains
-    (None: the control rows are used as they come).
+    `quaternions` are first entries in x; `nr`, `ng` the sizes of a control law's reference rows and gains
+    (nr None: the rows are the controls themselves).
     """
 
-    nx: int
+    nq: int
+    nv: int
+    na: int
     nu: int
     nw: int
     np: int
@@ -44,10 +46,20 @@ class Shape:
     nr: int | None = None
     ng: int = 0
 
+    @property
+    def nx(self) -> int:
+        """Size of the state (q, v, act)."""
+        return self.nq + self.nv + self.na
+
+    def split(self, e: Emitter, x: str) -> str:
+        """Call arguments q, v, act of a state at `x`."""
+        v, act = e.element(x, self.nq), e.element(x, self.nq + self.nv)
+        return f"ptr {x}, ptr {v}, ptr {act}"
+
 
 def combine(e: Emitter, out: str, x: str, h: str, terms: list[tuple[float, str]], size: int) -> None:
     """out = x + h sum_j weight_j k_j, over `size` scalars."""
-    with e.loop(size) as i:
+    for i in e.over(size):
         total = ""
         for weight, k in terms:
             value = e.load(k, i)
@@ -87,7 +99,14 @@ def live_stages(A: Array, b: Array) -> list[int]:
     return sorted(needed)
 
 
-CONTROL_ARGUMENTS = ["ptr noalias %r", "i64 %r_state", "i64 %r_period", "ptr noalias %g", "i64 %g_state", "ptr noalias %applied"]
+CONTROL_ARGUMENTS = [
+    "ptr noalias %r",
+    "i64 %r_state",
+    "i64 %r_period",
+    "ptr noalias %g",
+    "i64 %g_state",
+    "ptr noalias %applied",
+]
 
 
 class Control:
@@ -110,7 +129,7 @@ class Control:
             self.block.gather(rows, self.U, shape.nu)
             return
         self.block.gather(rows, self.R, shape.nr)
-        e.do(f"call void @law(ptr {X}, ptr {self.R}, ptr {self.G}, ptr {self.U})")
+        e.do(f"call void @law({shape.split(e, X)}, ptr {self.R}, ptr {self.G}, ptr {self.U})")
         per_state = e.emit(f"mul nsw i64 %periods, {shape.nu}")
         out = self.block.pointers("%applied", per_state)
         at = e.emit(f"mul nsw i64 {period}, {shape.nu}")
@@ -127,8 +146,8 @@ def buffer_outside(e: Emitter, size: int) -> str:
 def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     """Integration in fixed steps, as IR.
 
-    `void name(i64 n, i64 periods, i64 steps, i64 every, double h, x0, controls..., w, w_state, p, p_state,
-    path)`: `periods` control periods of `steps` steps; every `every` steps the state is recorded, the
+    `void name(i64 n, i64 periods, i64 steps, i64 every, double h, x0, controls..., w, w_state, w_row, p,
+    p_state, path)`: `periods` control periods of `steps` steps; every `every` steps the state is recorded, the
     initial one included. `w` has a row for each stage of each step.
     """
     e = Emitter(lanes)
@@ -138,9 +157,9 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     h = splat(e, "%h")
     stages = len(method.b)
     total = e.emit("mul nsw i64 %periods, %steps")
-    quotient = e.emit(f"sdiv i64 {total}, %every")
-    records = e.emit(f"add nsw i64 {quotient}, 1")
+    records = e.emit(f"add nsw i64 {e.emit(f'sdiv i64 {total}, %every')}, 1")
     per_state = e.emit(f"mul nsw i64 {records}, {shape.nx}")
+    left, row, out = e.cell(), e.cell(), e.cell()  # steps to the next record, row of w, place of the record
     with e.loop("%n", lanes) as first:
         block = Block(e, first, "%n")
         control = Control(e, shape, block, U)
@@ -149,32 +168,39 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
         w_rows = block.pointers("%w", "%w_state")
         path = block.pointers("%path", per_state)
         block.scatter(X, path, shape.nx)
+        e.put(left, "%every")
+        e.put(row, 0)
+        e.put(out, shape.nx)
         with e.loop("%periods") as period:
             control.hold(period, X)
-            with e.loop("%steps") as step:
-                done = e.emit(f"mul nsw i64 {period}, %steps")
-                number = e.emit(f"add nsw i64 {done}, {step}")
+            with e.loop("%steps"):
                 for i in used:
                     terms = [(float(method.A[i, j]), K[j]) for j in used if j < i and method.A[i, j] != 0.0]
-                    at = X
+                    at = Y if terms else X
                     if terms:
                         combine(e, Y, X, h, terms, shape.nx)
-                        at = Y
                     if shape.nw:
-                        row = e.emit(f"mul nsw i64 {number}, {stages}")
-                        row = e.emit(f"add nsw i64 {row}, {i}")
-                        offset = e.emit(f"mul nsw i64 {row}, {shape.nw}")
+                        number = e.emit(f"add nsw i64 {e.get(row)}, {i}")
+                        offset = e.emit(f"mul nsw i64 {number}, %w_row")
                         block.gather(shifted(e, w_rows, offset), W, shape.nw)
-                    e.do(f"call void @rate(ptr {at}, ptr {U}, ptr {W}, ptr {P}, ptr {K[i]})")
+                    e.do(f"call void @rate({shape.split(e, at)}, ptr {U}, ptr {W}, ptr {P}, ptr {K[i]})")
                 combine(e, X, X, h, [(float(method.b[i]), K[i]) for i in used if method.b[i]], shape.nx)
                 normalize(e, X, shape.quaternions)
-                reached = e.emit(f"add nsw i64 {number}, 1")
-                rest = e.emit(f"srem i64 {reached}, %every")
-                with e.when(e.emit(f"icmp eq i64 {rest}, 0")):
-                    record = e.emit(f"sdiv i64 {reached}, %every")
-                    offset = e.emit(f"mul nsw i64 {record}, {shape.nx}")
+                e.put(row, e.emit(f"add nsw i64 {e.get(row)}, {stages}"))
+                e.put(left, e.emit(f"sub nsw i64 {e.get(left)}, 1"))
+                with e.when(e.emit(f"icmp eq i64 {e.get(left)}, 0")):
+                    offset = e.get(out)
                     block.scatter(X, shifted(e, path, offset), shape.nx)
+                    e.put(out, e.emit(f"add nsw i64 {offset}, {shape.nx}"))
+                    e.put(left, "%every")
     arguments = ["i64 %n", "i64 %periods", "i64 %steps", "i64 %every", "double %h", "ptr noalias %x0"]
     arguments += CONTROL_ARGUMENTS
-    arguments += ["ptr noalias %w", "i64 %w_state", "ptr noalias %p", "i64 %p_state", "ptr noalias %path"]
+    arguments += [
+        "ptr noalias %w",
+        "i64 %w_state",
+        "i64 %w_row",
+        "ptr noalias %p",
+        "i64 %p_state",
+        "ptr noalias %path",
+    ]
     return function(name, arguments, e)

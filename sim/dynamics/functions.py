@@ -127,7 +127,9 @@ def _held_residual(eq: Equations, kind: str, tau: Sequence[Scalar]) -> tuple[lis
     return a, eq.residual_local(held, tau)
 
 
-def _implicit(eq: Equations, residual: Sequence[Scalar], seeds: list[dict[Node, Scalar]]) -> list[list[Scalar]]:
+def _implicit(
+    eq: Equations, residual: Sequence[Scalar], seeds: list[dict[Node, Scalar]]
+) -> list[list[Scalar]]:
     """Derivatives of the accelerations along `seeds`: -M^-1 times those of the residual."""
     out = []
     for column in directional(residual, seeds):
@@ -189,7 +191,9 @@ def _rate_jacobian(eq: Equations, kind: str) -> Tape:
     return eq.tape("q v act u w p", outputs)
 
 
-def _adjoint(eq: Equations, kind: str, bar: Sequence[Scalar], tau: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+def _adjoint(
+    eq: Equations, kind: str, bar: Sequence[Scalar], tau: Sequence[Scalar]
+) -> tuple[list[Scalar], list[Scalar]]:
     """Residual with accelerations held, and the multipliers -M^-1 bar (held) of its rows."""
     _, residual = _held_residual(eq, kind, tau)
     solved = eq.solve_local(eq.local(eq.spread(bar)), kind)
@@ -220,7 +224,9 @@ def _rate_vjp(eq: Equations, kind: str) -> Tape:
     zero: list[Scalar] = [0.0] * lay.nv
     residual, weights = _adjoint(eq, kind, bar[lay.nq : lay.nq + lay.nv], zero)
     rows = [*eq.coordinate_rate(), *residual, *eq.actuation[1]]
-    by = _gradients(eq, rows, [*bar[: lay.nq], *weights, *bar[lay.nq + lay.nv : lay.nx]], ("q", "v", "act", "u", "p"))
+    by = _gradients(
+        eq, rows, [*bar[: lay.nq], *weights, *bar[lay.nq + lay.nv : lay.nx]], ("q", "v", "act", "u", "p")
+    )
     return eq.tape("q v act u w p bar", {"x": by["q"] + by["v"] + by["act"], "u": by["u"], "p": by["p"]})
 
 

@@ -21,7 +21,9 @@ def keyed_joints(model: mujoco.MjModel, keyed: Keyed) -> tuple[int, ...]:
     array = np.asarray(keyed)
     if array.dtype == bool:
         if array.shape != (model.nv,):
-            raise EngineError(f"a mask of keyed freedoms has shape {array.shape}; this model needs ({model.nv},)")
+            raise EngineError(
+                f"a mask of keyed freedoms has shape {array.shape}; this model needs ({model.nv},)"
+            )
         counts = np.bincount(model.dof_jntid, weights=array, minlength=model.njnt)
         whole = np.bincount(model.dof_jntid, minlength=model.njnt)
         cut = [_name(model, j) for j in np.flatnonzero((counts > 0) & (counts < whole))]
@@ -30,7 +32,11 @@ def keyed_joints(model: mujoco.MjModel, keyed: Keyed) -> tuple[int, ...]:
         return tuple(int(j) for j in np.flatnonzero(counts))
     found = set()
     for entry in keyed:
-        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, entry) if isinstance(entry, str) else int(entry)
+        joint = (
+            mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, entry)
+            if isinstance(entry, str)
+            else int(entry)
+        )
         if not 0 <= joint < model.njnt:
             names = [_name(model, j) for j in range(model.njnt)]
             raise EngineError(unknown("joint", str(entry), names))

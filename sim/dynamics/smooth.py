@@ -9,11 +9,10 @@ Nothing is compiled before it is asked for; what was compiled once is found on d
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any
 
 import mujoco
@@ -24,15 +23,30 @@ from ..compile import jit
 from ..compile.cache import Cache, default_folder, key_of
 from ..compile.program import Bound, Build, Code, Program, map_source, obtain, workers
 from ..errors import EngineError
+from ..integrate.tableau import Tableau
+from ..integrate.tableaus import RK4
 from .fields import Parameter, parameter_index
 from .functions import FUNCTIONS, cheaper_formulation
+from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
+from .rollouts import Controls, Path, Prescribed, fixed, initial_states
 from .support import differences, unsupported
 from .symbolic import Equations
 
 Array = NDArray[np.float64]
 
-_MODEL_PREFIXES = ("body_", "jnt_", "dof_", "actuator_", "tendon_", "wrap_", "qpos", "eq_", "site_", "geom_fluid")
+_MODEL_PREFIXES = (
+    "body_",
+    "jnt_",
+    "dof_",
+    "actuator_",
+    "tendon_",
+    "wrap_",
+    "qpos",
+    "eq_",
+    "site_",
+    "geom_fluid",
+)
 _PARALLEL_OPERATIONS = 400_000  # work below which one thread is quicker
 
 
@@ -43,7 +57,9 @@ def model_fingerprint(model: mujoco.MjModel) -> bytes:
         if name.startswith(_MODEL_PREFIXES):
             value = getattr(model, name)
             if isinstance(value, np.ndarray):
-                parts.append(name.encode() + str(value.shape).encode() + np.ascontiguousarray(value).tobytes())
+                parts.append(
+                    name.encode() + str(value.shape).encode() + np.ascontiguousarray(value).tobytes()
+                )
     option = model.opt
     numbers = [*option.gravity, *option.wind, option.density, option.viscosity, model.stat.extent]
     flags = [option.disableflags, option.disableactuator, option.enableflags]
@@ -52,7 +68,7 @@ def model_fingerprint(model: mujoco.MjModel) -> bytes:
 
 def _code_fingerprint() -> str:
     """Hash of this engine's own source: another version never reads what this one compiled."""
-    here = Path(__file__).parent
+    here = FilePath(__file__).parent
     files = sorted([*here.glob("*.py"), *(here.parent / "compile").glob("*.py")])
     return key_of(*(file.read_bytes() for file in files))
 
@@ -92,7 +108,7 @@ def compile_model(
     friction_width: float | None = None,
     lanes: int | None = None,
     threads: int | None = None,
-    cache: Path | None | bool = True,
+    cache: FilePath | None | bool = True,
 ) -> Smooth:
     """The smooth engine for `model`.
 
@@ -142,15 +158,19 @@ class Smooth:
         self.threads = threads or workers()
         self.differences = tuple(differences(model, friction_width=friction_width))
         self.parameter_values = np.array(
-            [np.atleast_2d(getattr(model, f).T).T[r, c] for f, r, c in (parameter_index(model, p) for p in parameters)],
+            [
+                np.atleast_2d(getattr(model, f).T).T[r, c]
+                for f, r, c in (parameter_index(model, p) for p in parameters)
+            ],
             dtype=float,
         )
-        self._cache = cache
+        self.cache = cache
         self._programs: dict[tuple[str, int], Program] = {}
-        self._codes: dict[tuple[Any, ...], Code] = {}
+        self._codes: dict[str, Code] = {}
 
     @cached_property
-    def _key(self) -> str:
+    def key(self) -> str:
+        """Hash over everything that compiled code of this model depends on."""
         roles = repr((self.layout.keyed, self.parameters, self.friction_width))
         versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
         return key_of(model_fingerprint(self.model), roles, versions, _code_fingerprint())
@@ -180,9 +200,15 @@ class Smooth:
                 kernels, loops, facts = map_source(self.tape(name), lanes)
                 return kernels, loops, facts | {"formulation": self.formulation}
 
-            code = obtain(name, lanes, self._cache, key_of(self._key, "map", name, str(lanes)), make)
+            code = obtain(name, lanes, self.cache, key_of(self.key, "map", name, str(lanes)), make)
             found = self._programs[name, lanes] = Program(code, lanes)
         return found
+
+    def code(self, key: str, find: Callable[[], Code]) -> Code:
+        """Machine code by key, found once."""
+        if key not in self._codes:
+            self._codes[key] = find()
+        return self._codes[key]
 
     def bind(self, name: str) -> Bound:
         """Function `name` on its own arrays, for the quickest calls on one state."""
@@ -202,7 +228,9 @@ class Smooth:
             if name == "p":
                 return self.parameter_values
             if name == "w" and size:
-                raise EngineError("keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints")
+                raise EngineError(
+                    "keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints"
+                )
             return np.zeros(size)
         array = np.ascontiguousarray(value, dtype=np.float64)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
@@ -224,9 +252,7 @@ class Smooth:
         arrays = [rows[key] if key in rows else self._rows(key, None, sizes[key]) for key in program.inputs]
         work = count * program.build.operations
         outs = program(arrays, count, self.threads if work > _PARALLEL_OPERATIONS else 1)
-        return {
-            key: out[0] if single else out for key, out in zip(program.outputs, outs, strict=True)
-        }
+        return {key: out[0] if single else out for key, out in zip(program.outputs, outs, strict=True)}
 
     def forward(
         self,
@@ -243,7 +269,13 @@ class Smooth:
         return self.evaluate("forward", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)["a"]
 
     def inverse(
-        self, q: ArrayLike, v: ArrayLike, a: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        a: ArrayLike,
+        *,
+        w: ArrayLike | None = None,
+        p: ArrayLike | None = None,
     ) -> Array:
         """Forces on all the model's freedoms, beside passive ones, that produce the acceleration `a`."""
         return self.evaluate("inverse", q=q, v=v, a=a, w=w, p=p)["tau"]
@@ -339,6 +371,49 @@ class Smooth:
         wide = np.concatenate([wide, np.zeros((*wide.shape[:-1], spare))], axis=-1)
         return self.evaluate("vjp", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p, bar=wide)
 
+    def rollout(
+        self,
+        q0: ArrayLike,
+        v0: ArrayLike,
+        controls: Controls = None,
+        *,
+        step: float,
+        steps: int,
+        method: Tableau = RK4,
+        hold: int | None = None,
+        every: int = 1,
+        act0: ArrayLike | None = None,
+        w: Prescribed = None,
+        p: ArrayLike | None = None,
+        t0: float = 0.0,
+    ) -> Path:
+        """Integrate in `steps` steps of `step` seconds by an explicit Runge-Kutta `method`, compiled whole.
+
+        `controls` are an array, (nu,), (periods, nu) or (batch, periods, nu); a `LinearFeedback`; or a
+        function (t, q, v) -> u, called from Python at the start of each period. They are held over `hold`
+        steps (default: 1, or the whole span for a single row). Every `every` steps the state is recorded.
+        `w` prescribes the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), evaluated at the
+        stages' times. Raises EngineError for shapes that do not fit.
+        """
+        one_row = controls is None or (not callable(controls) and np.ndim(controls) == 1)  # type: ignore[arg-type]
+        hold = hold or (steps if one_row and not isinstance(controls, LinearFeedback) else 1)
+        for name, value in (("hold", hold), ("every", every)):
+            if value < 1 or steps % value:
+                raise EngineError(f"{name} is {value} steps, which must divide the {steps} steps of the run")
+        return fixed(
+            self,
+            initial_states(self, q0, v0, act0),
+            method=method,
+            step=float(step),
+            steps=steps,
+            controls=controls,
+            hold=hold,
+            every=every,
+            w=w,
+            p=p,
+            t0=t0,
+        )
+
 
 @dataclass(frozen=True)
 class Derivatives:
@@ -352,6 +427,3 @@ class Derivatives:
 
 def _square(flat: Array, n: int) -> Array:
     return flat.reshape(*flat.shape[:-1], n, n)
-
-
-_ = ctypes

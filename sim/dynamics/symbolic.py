@@ -152,7 +152,9 @@ class Equations:
     @cached_property
     def factor(self) -> Factor:
         """Factor of `mass_local`."""
-        return Factor.of(self.mass_local, dof_parents(self.tree, self.model.nv, self.skip), self.layout.v_free)
+        return Factor.of(
+            self.mass_local, dof_parents(self.tree, self.model.nv, self.skip), self.layout.v_free
+        )
 
     def solve_local(self, b: Sequence[Scalar], formulation: str) -> list[Scalar]:
         """x with M x = b over the state's freedoms, in the model's order."""
@@ -209,7 +211,10 @@ class Equations:
         for link, at in zip(self.tree.links, self.where, strict=True):
             if link.kind == FREE and link.dadr not in self.skip:
                 first = link.dadr
-                block = [[M[max(i, j), min(i, j)] for j in range(first, first + 3)] for i in range(first, first + 3)]
+                block = [
+                    [M[max(i, j), min(i, j)] for j in range(first, first + 3)]
+                    for i in range(first, first + 3)
+                ]
                 block = at.symmetric(block)
                 for row in sorted({i for i, j in M if j == first and i >= first + 3}):
                     turned = at.to_parent([M[row, first + k] for k in range(3)])

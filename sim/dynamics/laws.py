@@ -1,0 +1,122 @@
+"""Control laws that run inside compiled integrations, sampled at their period and held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..compile.graph import Graph, Scalar
+from ..compile.tape import Tape
+from ..errors import EngineError
+from . import spatial
+from .layout import Layout
+from .tree import BALL, FREE
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LinearFeedback:
+    """u = u_ref + K ((q_ref - q), (v_ref - v)), with the difference of q taken in the tangent space.
+
+    Attributes:
+        K: gains, shape (nu, 2 nv) or (batch, nu, 2 nv); where it is zero nothing is computed.
+        q_ref, v_ref, u_ref: references, shape (n,), (periods, n) or (batch, periods, n); None stands for zero
+            (for q: the model's qpos0).
+    """
+
+    K: ArrayLike
+    q_ref: ArrayLike | None = None
+    v_ref: ArrayLike | None = None
+    u_ref: ArrayLike | None = None
+
+    def pattern(self) -> NDArray[np.bool_]:
+        """Where gains are."""
+        K = np.asarray(self.K)
+        return K.astype(bool) if K.ndim == 2 else K.any(axis=0)
+
+    def gains(self) -> Array:
+        """The gains of the pattern, shape (ng,) or (batch, ng)."""
+        return np.ascontiguousarray(np.asarray(self.K, dtype=float)[..., self.pattern()])
+
+    def references(self, layout: Layout, home: Array, periods: int) -> Array:
+        """Rows (q_ref, v_ref, u_ref), shape (nr,), (periods, nr) or (batch, periods, nr)."""
+        parts = []
+        for name, value, size in (
+            ("q_ref", home if self.q_ref is None else self.q_ref, layout.nq),
+            ("v_ref", np.zeros(layout.nv) if self.v_ref is None else self.v_ref, layout.nv),
+            ("u_ref", np.zeros(layout.nu) if self.u_ref is None else self.u_ref, layout.nu),
+        ):
+            array = np.asarray(value, dtype=float)
+            if (
+                array.ndim not in (1, 2, 3)
+                or array.shape[-1] != size
+                or array.shape[-2:-1] not in ((), (periods,))
+            ):
+                raise EngineError(
+                    f"{name} has shape {array.shape}; expected ({size},) or (..., {periods}, {size})"
+                )
+            parts.append(array)
+        lead = np.broadcast_shapes(*(p.shape[:-1] for p in parts))
+        return np.ascontiguousarray(
+            np.concatenate([np.broadcast_to(p, (*lead, p.shape[-1])) for p in parts], axis=-1)
+        )
+
+    def tape(self, layout: Layout) -> Tape:
+        """The law as a program (q, v, act, r, g) -> u."""
+        mask = self.pattern()
+        if mask.shape != (layout.nu, 2 * layout.nv):
+            raise EngineError(f"K has shape {mask.shape}; expected ({layout.nu}, {2 * layout.nv})")
+        graph, sizes = Graph(), {"q": layout.nq, "v": layout.nv, "act": layout.na}
+        sizes |= {"r": layout.nq + layout.nv + layout.nu, "g": int(mask.sum())}
+        nodes = {name: graph.inputs(name, size) for name, size in sizes.items()}
+        r = nodes["r"]
+        error = _difference(layout, r[: layout.nq], nodes["q"])
+        error += spatial.sub(r[layout.nq : layout.nq + layout.nv], nodes["v"])
+        gains, out = iter(nodes["g"]), []
+        for row, feedforward in zip(mask, r[layout.nq + layout.nv :], strict=True):
+            total: Scalar = feedforward
+            for j in np.flatnonzero(row):
+                total = total + next(gains) * error[j]
+            out.append(total)
+        return Tape.build(sizes, {"u": out})
+
+
+def _difference(layout: Layout, to: list[Scalar], start: list[Scalar]) -> list[Scalar]:
+    """Tangent from q = `start` to `to`, as mj_differentiatePos over one second."""
+    out: list[Scalar] = []
+    for kind, at, _ in layout.blocks:
+        if kind in (FREE, BALL):
+            if kind == FREE:
+                out += spatial.sub(to[at : at + 3], start[at : at + 3])
+                at += 3
+            w, x, y, z = start[at : at + 4]
+            turn = spatial.quaternion_product([w, -x, -y, -z], to[at : at + 4])
+            out += spatial.rotation_vector(turn)
+        else:
+            out.append(to[at] - start[at])
+    return out
+
+
+def joint_pd(model: mujoco.MjModel, kp: ArrayLike, kd: ArrayLike) -> Array:
+    """Gains K of a PD law for motors that drive one hinge or slide each: force kp (q_ref - q) + kd (v_ref - v).
+
+    `kp`, `kd` are per actuator (or one number for all) at the joint; gear and gain are divided out.
+    Raises EngineError for an actuator that is not a motor on a hinge or slide.
+    """
+    kp, kd = (np.broadcast_to(np.asarray(k, dtype=float), (model.nu,)) for k in (kp, kd))
+    K = np.zeros((model.nu, 2 * model.nv))
+    for actuator in range(model.nactuator):
+        joint = model.actuator_trnid[actuator, 0]
+        on_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        plain = model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_NONE)
+        if not (on_joint and plain and model.jnt_type[joint] not in (FREE, BALL)):
+            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator) or f"#{actuator}"
+            raise EngineError(f"actuator {name} is not a motor on a hinge or slide: give the gains K in full")
+        unit = model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0]
+        dof = model.jnt_dofadr[joint]
+        K[actuator, dof], K[actuator, model.nv + dof] = kp[actuator] / unit, kd[actuator] / unit
+    return K
