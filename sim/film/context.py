@@ -112,8 +112,9 @@ def _egl_platform() -> Any:
         """
 
         def delete_context(self) -> None:
-            display, context = self._egl_display, self._egl_context
-            self._egl_display = self._egl_context = None
+            shared: Any = self
+            display, context = shared._egl_display, shared._egl_context
+            shared._egl_display = shared._egl_context = None
             if display is None or context is None:
                 return
             current = EGL.eglGetCurrentContext()

@@ -58,7 +58,8 @@ def geom_shape(
 def _plane(size: Floats, radius: float) -> Shape:
     unit = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
     corners = unit * np.where(size > 0, size, radius)
-    uv = np.where(size > 0, (unit + 1) / 2, corners / 2) * [1, -1]  # without an end: one image in two metres
+    down = np.array([1, -1])  # images begin at the top; without an end, one image covers two metres
+    uv = np.where(size > 0, (unit * down + 1) / 2, corners * down / 2)
     flat = np.column_stack([corners, np.zeros(4)])
     return Shape(flat, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), uv)
 
