@@ -110,7 +110,7 @@ def _mismatches(driver: Driver, rig: Rig, id: int, found: Found, take_over: bool
 
 def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torque: bool) -> Ready:
     """Settings, profiles, feedback block, goal := present: everything but torque."""
-    changed: list[str] = []
+    changed: dict[str, list[int]] = {}
     for i, item in enumerate(rig.servos):
         id = item.id
         driver.write_raw(id, "status_return_level", 2)
@@ -127,7 +127,7 @@ def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torqu
                         servo=id,
                     )
                 driver.write_raw(id, name, raw)
-                changed.append(f"{rig.label(id)}: {name} {found} -> {raw}")
+                changed.setdefault(f"{name} {found} -> {raw}", []).append(id)
         driver.return_delay[id] = driver.read(id, "return_delay_time")
         # After the mode: changing it puts profiles and gains back.
         _write_at_least_one(driver, id, "profile_velocity", _PROFILE_MARGIN * bounds.velocity[i])
@@ -151,7 +151,8 @@ def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torqu
             "puts it: they would fight; check direction and zero",
             servo=id,
         )
-    return Ready(block, present, tuple(changed), torque)
+    notes = tuple(f"{what} on servo {', '.join(map(str, ids))}" for what, ids in changed.items())
+    return Ready(block, present, notes, torque)
 
 
 def _write_at_least_one(driver: Driver, id: int, name: str, value: float) -> None:
@@ -199,9 +200,13 @@ def torque_on(driver: Driver, rig: Rig) -> None:
 
 def release(driver: Driver, rig: Rig) -> list[str]:
     """Torque off, everywhere; what could not be confirmed, as sentences."""
-    return _each(
-        driver, rig, "let go", lambda id: driver.write_raw(id, "torque_enable", 0), "torque_enable", 0
-    )
+    for _ in range(2):  # the quickest word first: one packet to all, unanswered
+        driver.sync_write(rig.ids, "torque_enable", [0] * len(rig.ids))
+
+    def let_go(id: int) -> None:
+        driver.write_raw(id, "torque_enable", 0)
+
+    return _each(driver, rig, "let go", let_go, torque=0)
 
 
 def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> list[str]:
@@ -217,38 +222,33 @@ def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> list[str]:
         if at_present:
             driver.write_raw(id, "goal_position", driver.read_raw(id, "present_position"))
         driver.write_raw(id, "bus_watchdog", 0)
+
+    return _each(driver, rig, "hold", hold, torque=1)
+
+
+def _each(driver: Driver, rig: Rig, what: str, act: Callable[[int], None], *, torque: int) -> list[str]:
+    """Do it to every servo, then look at every servo again: torque as wanted, no error."""
+
+    def look(id: int) -> None:
         if error := driver.read_raw(id, "hardware_error_status"):
-            raise RigFault("stop", f"hardware error: {error_names(error)}", servo=id)
-        if not driver.read_raw(id, "torque_enable"):
-            raise RigFault("stop", "it has no torque", servo=id)
+            raise RigFault("stop", f"it reports a hardware error: {error_names(error)}", servo=id)
+        if driver.read_raw(id, "torque_enable") != torque:
+            raise RigFault("stop", f"its torque is {'off' if torque else 'still on'}", servo=id)
+        if torque and driver.read_raw(id, "bus_watchdog") < 0:
+            raise RigFault("stop", "its bus watchdog tripped, so it stands already", servo=id)
 
-    return _each(driver, rig, "hold", hold)
-
-
-def _each(
-    driver: Driver,
-    rig: Rig,
-    what: str,
-    act: Callable[[int], None],
-    register: str | None = None,
-    value: int = 0,
-) -> list[str]:
-    failed = []
-    if register is not None:  # the quickest word first: one packet to all, twice, unanswered
-        for _ in range(2):
-            driver.sync_write(rig.ids, register, [value] * len(rig.ids))
-    for id in rig.ids:
-        try:
-            act(id)
-        except (Refused, RigFault) as e:
-            failed.append(f"{rig.label(id)} did not {what}: {e}")
-        except NoAnswer:
-            failed.append(
-                f"{rig.label(id)} did not confirm to {what}; its watchdog stops it after {rig.watchdog:g} s"
-            )
-        except BusError as e:
-            failed.append(
-                f"no servo can be reached any more ({e}); watchdogs stop them after {rig.watchdog:g} s"
-            )
-            break
-    return failed
+    failed: dict[int, str] = {}
+    for step in (act, look):
+        for id in rig.ids:
+            if id in failed:
+                continue
+            label = rig.label(id)
+            try:
+                step(id)
+            except (Refused, RigFault) as e:
+                failed[id] = f"{label} did not {what}: {e}"
+            except NoAnswer:
+                failed[id] = f"{label} did not confirm to {what}; its watchdog stops it in {rig.watchdog:g} s"
+            except BusError as e:
+                failed[id] = f"{label} is out of reach ({e}); its watchdog stops it in {rig.watchdog:g} s"
+    return list(failed.values())

@@ -171,11 +171,14 @@ class Session:
         out, driver, rig = self.outcome, self.driver, self.rig
         try:
             if how == "hold":
-                out.unconfirmed += freeze(driver, rig, at_present=out.status != "done")
+                failed = freeze(driver, rig, at_present=out.status != "done")
                 out.stop = "holds its pose; torque stays on and warms it until 'pantograph servo stop'"
             else:
-                out.unconfirmed += release(driver, rig)
+                failed = release(driver, rig)
                 out.stop = "parked, then limp" if how == "park" else "limp: torque is off"
+            out.unconfirmed += failed
+            if len(failed) == len(rig.ids):
+                out.stop = "left to the watchdogs: no servo confirmed anything"
         except BusError as e:
             everyone = "; ".join(rig.label(i) for i in rig.ids)
             out.unconfirmed.append(f"{e}; watchdogs stop after {rig.watchdog:g} s: {everyone}")
