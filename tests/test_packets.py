@@ -183,4 +183,5 @@ def test_noise_is_reported_in_bounded_pieces():
     parser = Parser()
     out = parser.feed(bytes(100_000))
     assert all(len(e.data) <= Parser.NOISE_PIECE for e in out)
+    assert sum(len(e.data) for e in out) > 100_000 - Parser.NOISE_PIECE - 4
     assert parser.pending < 4

@@ -354,10 +354,13 @@ def _blocks(packet: Packet) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _group_write(hearing: list[VirtualServo], packet: Packet) -> None:
+    members: dict[int, list[VirtualServo]] = {}
+    for servo in hearing:
+        for id in servo.ids:
+            members.setdefault(id, []).append(servo)
     for id, address, data in _blocks(packet):
-        for servo in hearing:
-            if servo.answers_to(id):
-                servo.write(address, data, shadow=servo.id != id)
+        for servo in members.get(id, ()):
+            servo.write(address, data, shadow=servo.id != id)
 
 
 def _find(servos: list[VirtualServo], id: int) -> VirtualServo | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import exp, pi
 from types import MappingProxyType
 from typing import Protocol
@@ -44,27 +45,27 @@ class Motor:
     thermal_time: float = 200.0
     line_resistance: float = 0.1
 
-    @property
+    @cached_property
     def resistance(self) -> float:
         """Winding and driver [ohm]."""
         return self.voltage / self.stall_current
 
-    @property
+    @cached_property
     def coulomb(self) -> float:
         """Coulomb friction at the output [N*m]."""
         return self.friction * self.stall_torque
 
-    @property
+    @cached_property
     def kt(self) -> float:
         """Torque constant [N*m/A]: the stall torque is what friction leaves over."""
         return self.stall_torque * (1 + self.friction) / self.stall_current
 
-    @property
+    @cached_property
     def ke(self) -> float:
         """Back-EMF constant [V*s/rad]: at the no-load speed the current carries the friction alone."""
         return (self.voltage - self.resistance * self.coulomb / self.kt) / self.no_load_speed
 
-    @property
+    @cached_property
     def inertia(self) -> float:
         """Rotor and gear at the output shaft [kg*m^2]."""
         return self.mechanical_time * self.stall_torque / self.no_load_speed

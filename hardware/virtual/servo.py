@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import inf
 
 from ..errors import HardwareError
-from ..packets import ALERT, BROADCAST, Instruction, Packet, StatusError, status
+from ..packets import ALERT, BROADCAST, MAX_ID, Instruction, Packet, StatusError, status
 from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register, control_table
 from ..tables.rows import POSITION, VELOCITY
 from . import drive as d
@@ -139,12 +139,15 @@ class VirtualServo:
         """Register in SI units."""
         return self.table[name].to_si(self.get(name))
 
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Own ID, and the shadow ID when there is one."""
+        own, shadow = self.id, self.memory.get("secondary_id")
+        return (own, shadow) if shadow <= MAX_ID and shadow != own else (own,)
+
     def answers_to(self, id: int) -> bool:
         """Whether a packet with this ID is executed here (own ID, shadow ID or broadcast)."""
-        return id in (self.id, BROADCAST) or self._is_shadow(id)
-
-    def _is_shadow(self, id: int) -> bool:
-        return id == self.memory.get("secondary_id") <= 252 and id != self.id
+        return id == BROADCAST or id in self.ids
 
     @property
     def reads_fast(self) -> bool:
@@ -301,9 +304,9 @@ class VirtualServo:
         Sync and bulk instructions, whose replies form a chain, are the bus's; it calls `write` and
         `reply_to_read`.
         """
-        silent = packet.id != self.id
-        shadow = self._is_shadow(packet.id)
         own = self.id
+        silent = packet.id != own
+        shadow = silent and packet.id != BROADCAST
         error, data = self._do(packet, shadow)
         level = self.memory.get("status_return_level")
         if packet.instruction == Instruction.PING:
