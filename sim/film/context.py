@@ -53,6 +53,10 @@ def _load() -> str:
         kind = asked or ("egl" if _egl_answers() else "osmesa")
     # PyOpenGL reads the variable at its import only; afterwards it goes back to what it was.
     os.environ["PYOPENGL_PLATFORM"] = kind
+    # pyrender imports pyglet for its window, which looks for X libraries unless told that there is no screen.
+    import pyglet
+
+    pyglet.options["headless"] = True
     try:
         importlib.import_module(f"pyrender.platforms.{kind}")
     except Exception as error:  # a missing library shows as ImportError, AttributeError or GLError
@@ -118,9 +122,12 @@ def _egl_platform() -> Any:
             if display is None or context is None:
                 return
             current = EGL.eglGetCurrentContext()
-            if ctypes.cast(current, ctypes.c_void_p).value == ctypes.cast(context, ctypes.c_void_p).value:
-                EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
-            EGL.eglDestroyContext(display, context)
+            with suppress(
+                EGL.EGLError
+            ):  # another library may have ended the display, and the context with it
+                if ctypes.cast(current, ctypes.c_void_p).value == ctypes.cast(context, ctypes.c_void_p).value:
+                    EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+                EGL.eglDestroyContext(display, context)
 
     devices = egl.query_devices() if egl._eglQueryDevicesEXT is not None else [egl.EGLDevice(None)]
     failures = []
