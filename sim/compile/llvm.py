@@ -75,6 +75,23 @@ class Emitter:
         self._count += 1
         return f"%r{self._count}"
 
+    def label(self, prefix: str) -> str:
+        """A new name for blocks."""
+        self._count += 1
+        return f"{prefix}{self._count}"
+
+    def scalar(self) -> Emitter:
+        """Writer of scalar instructions into the same function."""
+        other = Emitter(1)
+        other.lines, other.fresh, other.label = self.lines, self.fresh, self.label  # type: ignore[method-assign]
+        return other
+
+    def slot(self, count: int, type: str = "") -> str:
+        """Memory for `count` values of `type` (default: in all lanes), allocated at the function's entry."""
+        register = self.fresh()
+        self.lines.insert(0, f"  {register} = alloca [{max(count, 1)} x {type or self.V}], align 64")
+        return register
+
     def emit(self, text: str) -> str:
         """Append an instruction with a result; returns its register."""
         register = self.fresh()
@@ -138,8 +155,7 @@ class Emitter:
     @contextmanager
     def loop(self, count: str | int, step: int = 1) -> Iterator[str]:
         """Counted loop from 0 (skipped when empty); yields the counter."""
-        name = f"L{self._count}"
-        self._count += 1
+        name = self.label("L")
         self.do(f"br label %{name}.entry")
         self.lines.append(f"{name}.entry:")
         self.do(f"br label %{name}.head")
@@ -164,12 +180,6 @@ class Emitter:
             with self.loop(size) as i:
                 yield i
 
-    def cell(self) -> str:
-        """Memory for an integer, allocated at the function's entry."""
-        register = self.fresh()
-        self.lines.insert(0, f"  {register} = alloca i64, align 8")
-        return register
-
     def get(self, cell: str) -> str:
         """The integer in a cell."""
         return self.emit(f"load i64, ptr {cell}, align 8")
@@ -181,8 +191,7 @@ class Emitter:
     @contextmanager
     def when(self, condition: str) -> Iterator[None]:
         """Instructions executed only if the i1 `condition` holds."""
-        name = f"W{self._count}"
-        self._count += 1
+        name = self.label("W")
         self.do(f"br i1 {condition}, label %{name}.then, label %{name}.end")
         self.lines.append(f"{name}.then:")
         yield

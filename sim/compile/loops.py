@@ -47,11 +47,6 @@ class Block:
                 e.do(f"store double {entry}, ptr {e.element(pointer, i, 'double')}, align 8")
 
 
-def buffer(e: Emitter, size: int) -> str:
-    """Stack memory for `size` scalars in all lanes."""
-    return e.emit(f"alloca [{max(size, 1)} x {e.V}], align 64")
-
-
 def shifted(e: Emitter, pointers: list[str], offset: str) -> list[str]:
     """Pointers moved by `offset` doubles."""
     return [e.element(pointer, offset, "double") for pointer in pointers]
@@ -75,7 +70,7 @@ def map_function(name: str, kernel: str, tape: Tape, lanes: int) -> str:
     """
     e = Emitter(lanes)
     ins, outs = list(tape.inputs.values()), list(tape.outputs.values())
-    buffers = [buffer(e, size) for size in ins], [buffer(e, size) for size in outs]
+    buffers = [e.slot(size) for size in ins], [e.slot(size) for size in outs]
     with e.loop("%n", lanes) as first:
         block = Block(e, first, "%n")
         for k, size in enumerate(ins):

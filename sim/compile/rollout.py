@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .llvm import Emitter
-from .loops import Block, buffer, function, shifted
+from .loops import Block, function, shifted
 
 Array = NDArray[np.float64]
 
@@ -115,8 +115,8 @@ class Control:
     def __init__(self, e: Emitter, shape: Shape, block: Block, U: str):
         self.e, self.shape, self.block, self.U = e, shape, block, U
         self.rows = block.pointers("%r", "%r_state")
-        self.R = buffer_outside(e, shape.nr or 0)
-        self.G = buffer_outside(e, shape.ng)
+        self.R = e.slot(shape.nr or 0)
+        self.G = e.slot(shape.ng)
         if shape.nr is not None:
             block.gather(block.pointers("%g", "%g_state"), self.G, shape.ng)
 
@@ -136,13 +136,6 @@ class Control:
         self.block.scatter(self.U, shifted(e, out, at), shape.nu)
 
 
-def buffer_outside(e: Emitter, size: int) -> str:
-    """A buffer allocated at the function's entry although asked for inside a loop."""
-    register = e.fresh()
-    e.lines.insert(0, f"  {register} = alloca [{max(size, 1)} x {e.V}], align 64")
-    return register
-
-
 def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     """Integration in fixed steps, as IR.
 
@@ -151,15 +144,17 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     initial one included. `w` has a row for each stage of each step.
     """
     e = Emitter(lanes)
-    X, Y, U, W, P = (buffer(e, size) for size in (shape.nx, shape.nx, shape.nu, shape.nw, shape.np))
+    X, Y, U, W, P = (e.slot(size) for size in (shape.nx, shape.nx, shape.nu, shape.nw, shape.np))
     used = live_stages(method.A, method.b)
-    K = {i: buffer(e, shape.nx) for i in used}
+    K = {i: e.slot(shape.nx) for i in used}
     h = splat(e, "%h")
     stages = len(method.b)
     total = e.emit("mul nsw i64 %periods, %steps")
     records = e.emit(f"add nsw i64 {e.emit(f'sdiv i64 {total}, %every')}, 1")
     per_state = e.emit(f"mul nsw i64 {records}, {shape.nx}")
-    left, row, out = e.cell(), e.cell(), e.cell()  # steps to the next record, row of w, place of the record
+    left, row, out = (
+        e.slot(1, "i64") for _ in range(3)
+    )  # steps to the next record, row of w, place of the record
     with e.loop("%n", lanes) as first:
         block = Block(e, first, "%n")
         control = Control(e, shape, block, U)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compile.adaptive import STATISTICS, adaptive_steps
 from ..compile.cache import key_of
 from ..compile.llvm import declarations, kernel
 from ..compile.loops import declare
@@ -32,7 +34,11 @@ _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
 _FIXED = [_COUNT] * 4 + [ctypes.c_double, _POINTER]
 _FIXED += [_POINTER, _COUNT, _COUNT, _POINTER, _COUNT, _POINTER]
 _FIXED += [_POINTER, _COUNT, _COUNT, _POINTER, _COUNT, _POINTER]
+_ADAPTIVE = [_COUNT] * 2 + [ctypes.c_double] * 4 + [_POINTER, ctypes.c_double, _POINTER, _POINTER]
+_ADAPTIVE += [_POINTER, _COUNT, _COUNT, _POINTER, _COUNT, _POINTER]
+_ADAPTIVE += [_POINTER, _COUNT, _POINTER, _COUNT, _COUNT, _POINTER, _POINTER, _POINTER]
 _PARALLEL_OPERATIONS = 400_000
+STATUS = ("success", "too many steps", "step too small", "not finite")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,19 +49,26 @@ class Path:
         t: times of the records [s], shape (records,).
         x: states (q, v, act), shape (records, nx), or (batch, records, nx).
         u: controls applied, shape ([batch,] periods, nu); one row if they did not change.
-        finite: whether every number of the motion is finite, a bool or shape (batch,).
+        status: how each motion ended, an index of STATUS; 0 is success. After a failure records are NaN.
         evaluations: of dx/dt, for each state.
+        rejected: steps done again, for each state (fixed steps: none).
         seconds: wall time of the integration itself.
     """
 
     t: Array
     x: Array
     u: Array
-    finite: NDArray[np.bool_]
+    status: NDArray[np.int64]
     evaluations: NDArray[np.int64]
+    rejected: NDArray[np.int64]
     seconds: float
     nq: int
     nv: int
+
+    @property
+    def success(self) -> bool:
+        """Whether every motion reached its end."""
+        return not np.any(self.status)
 
     @property
     def q(self) -> Array:
@@ -74,7 +87,11 @@ class Path:
 
 
 def _method_key(method: Tableau) -> str:
-    return key_of(method.A.tobytes(), method.b.tobytes())
+    dense = method.dense
+    arrays = [method.A, method.b, method.b_error, method.b_error_low, dense.A, dense.P]
+    return key_of(
+        *(b"" if x is None else x.tobytes() for x in arrays), repr((method.error_exponent, method.fsal))
+    )
 
 
 def shape_of(smooth: Smooth, law: LinearFeedback | None) -> Shape:
@@ -236,13 +253,66 @@ def fixed(
     begin = time.perf_counter()
     in_parallel(call, count, lanes, smooth.threads if work > _PARALLEL_OPERATIONS else 1)
     seconds = time.perf_counter() - begin
-    shown = (
-        applied
-        if law is not None
-        else np.broadcast_to(np.atleast_2d(rows.array), (count, *np.atleast_2d(rows.array).shape[-2:]))
-    )
+    shown = applied if law is not None else _shown(rows, count)
     t = t0 + step * every * np.arange(path.shape[1])
     return finish(smooth, start, t, path, shown, np.full(count, evaluations), seconds)
+
+
+def adaptive(
+    smooth: Smooth,
+    start: Start,
+    t_eval: Array,
+    *,
+    method: Tableau,
+    rtol: float,
+    atol: float | Array,
+    controls: Controls,
+    hold: float | None,
+    p: ArrayLike | None,
+    first_step: float | None,
+    max_steps: int,
+) -> Path:
+    """Integration to a tolerance; see `Smooth.integrate`."""
+    lay, count = smooth.layout, len(start.x)
+    t0, t1 = float(t_eval[0]), float(t_eval[-1])
+    periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
+    law, rows, gains = control_rows(smooth, controls, periods, count)
+    parameters = per_state("p", smooth.parameter_values if p is None else p, len(smooth.parameters), count)
+    tolerance = np.ascontiguousarray(np.broadcast_to(np.asarray(atol, dtype=float), (lay.nx,)))
+    lanes = 1 if count == 1 else smooth.lanes
+    code = loop_code(smooth, "adaptive", lanes, law, method, adaptive_steps)
+    run = code.loaded.function("adaptive", *_ADAPTIVE)
+    path = np.full((count, len(t_eval), lay.nx), np.nan)
+    path[:, 0] = start.x
+    last, stats = np.empty_like(start.x), np.zeros((count, len(STATISTICS)))
+    h0 = np.full(count, first_step or min(t1 - t0, hold or np.inf) * 1e-3)
+    applied = np.empty((count, periods if law is not None else 0, lay.nu))
+
+    def call(first: int, size: int) -> None:
+        def at(rows: Rows) -> int:
+            return address(rows.array) + 8 * first * rows.per_state
+
+        run(
+            size, periods, t0, t1, hold or t1 - t0, rtol, address(tolerance), float(max_steps),
+            address(start.x) + 8 * first * lay.nx, address(h0) + 8 * first,
+            at(rows), rows.per_state, rows.per_row, at(gains), gains.per_state,
+            address(applied) + 8 * first * periods * lay.nu, at(parameters), parameters.per_state,
+            address(t_eval), len(t_eval), 1,
+            address(path) + 8 * first * path[0].size, address(last) + 8 * first * lay.nx,
+            address(stats) + 8 * first * len(STATISTICS),
+        )  # fmt: skip
+
+    begin = time.perf_counter()
+    in_parallel(call, count, lanes, smooth.threads if count > lanes else 1)
+    seconds = time.perf_counter() - begin
+    shown = applied if law is not None else _shown(rows, count)
+    steps, rejected, evaluations, status = stats.astype(np.int64).T[:4]
+    return finish(smooth, start, t_eval, path, shown, evaluations, seconds, rejected=rejected, status=status)
+
+
+def _shown(rows: Rows, count: int) -> Array:
+    table = np.atleast_2d(rows.array)
+    return np.broadcast_to(table, (count, *table.shape[-2:]))
 
 
 def finish(
@@ -253,14 +323,20 @@ def finish(
     u: Array,
     evaluations: NDArray[np.int64],
     seconds: float,
+    *,
+    rejected: NDArray[np.int64] | None = None,
+    status: NDArray[np.int64] | None = None,
 ) -> Path:
     """The result as it was asked for: a batch or one state."""
-    ok = np.isfinite(path[:, -1]).all(axis=1)
+    rejected = np.zeros(len(path), np.int64) if rejected is None else rejected
+    status = np.zeros(len(path), np.int64) if status is None else status
+    status = np.where((status == 0) & ~np.isfinite(path[:, -1]).all(axis=1), len(STATUS) - 1, status)
     if start.single:
-        path, u, ok, evaluations = path[0], u[0], ok[0], evaluations[0]
+        path, u, status, evaluations, rejected = path[0], u[0], status[0], evaluations[0], rejected[0]
+    t = t.view()
     for array in (t, path, u):
         array.setflags(write=False)
-    return Path(t, path, u, ok, evaluations, seconds, smooth.layout.nq, smooth.layout.nv)
+    return Path(t, path, u, status, evaluations, rejected, seconds, smooth.layout.nq, smooth.layout.nv)
 
 
 def _prescribed_rows(smooth: Smooth, w: Prescribed, times: Array, count: int) -> Rows:

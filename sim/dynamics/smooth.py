@@ -24,12 +24,12 @@ from ..compile.cache import Cache, default_folder, key_of
 from ..compile.program import Bound, Build, Code, Program, map_source, obtain, workers
 from ..errors import EngineError
 from ..integrate.tableau import Tableau
-from ..integrate.tableaus import RK4
+from ..integrate.tableaus import DOPRI5, RK4
 from .fields import Parameter, parameter_index
 from .functions import FUNCTIONS, cheaper_formulation
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
-from .rollouts import Controls, Path, Prescribed, fixed, initial_states
+from .rollouts import Controls, Path, Prescribed, adaptive, fixed, initial_states
 from .support import differences, unsupported
 from .symbolic import Equations
 
@@ -412,6 +412,52 @@ class Smooth:
             w=w,
             p=p,
             t0=t0,
+        )
+
+    def integrate(
+        self,
+        q0: ArrayLike,
+        v0: ArrayLike,
+        t_eval: ArrayLike,
+        controls: Controls = None,
+        *,
+        method: Tableau = DOPRI5,
+        rtol: float = 1e-6,
+        atol: float | Array = 1e-6,
+        hold: float | None = None,
+        act0: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+        first_step: float | None = None,
+        max_steps: int = 1_000_000,
+    ) -> Path:
+        """Integrate from t_eval[0] to t_eval[-1] with steps that follow the tolerances, compiled whole.
+
+        The states at `t_eval` [s] (ascending) come from the method's continuous extension. `controls` as for
+        `rollout`, held over `hold` seconds (None: the whole span). Raises EngineError for shapes that do not
+        fit, for a method without an error estimate and for keyed joints (use `rollout`, or `problem` with
+        `sim.integrate.solve`).
+        """
+        times = np.ascontiguousarray(t_eval, dtype=np.float64)
+        if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
+            raise EngineError("t_eval must hold two or more ascending times")
+        if not method.adaptive:
+            raise EngineError(f"{method.name} does not estimate its error: use rollout with a fixed step")
+        if self.layout.keyed:
+            raise EngineError(
+                "integrate does not take keyed joints: use rollout, or problem with integrate.solve"
+            )
+        return adaptive(
+            self,
+            initial_states(self, q0, v0, act0),
+            times,
+            method=method,
+            rtol=float(rtol),
+            atol=atol,
+            controls=controls,
+            hold=hold,
+            p=p,
+            first_step=first_step,
+            max_steps=max_steps,
         )
 
 
