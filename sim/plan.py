@@ -288,6 +288,9 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
         out.append("dry friction: physics.friction = false")
     if physics.gravity is False:
         out.append("gravity: physics.gravity = false")
+    if setup.overruled:
+        first = scene.models[0].name
+        out.append(f"options of further models: {', '.join(setup.overruled)} are those of {first!r}")
     if engine == "kinematic":
         out.append(
             "all dynamics: nothing but keys moves; recorded frames are checked for overlaps and limits"

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import chain, load_spec
+from ...models import captured_warnings, chain, load_spec
 from ..errors import ModelError, unknown
 from .mistakes import Mistake
 from .schema import ModelItem, Placement, PropItem, Scene
@@ -61,7 +61,8 @@ def _host(specs: list[tuple[ModelItem, mujoco.MjSpec]], scene: Scene) -> mujoco.
         if i == 0:
             _copy_options(child, host)
         frame = host.worldbody.add_frame(pos=item.position, quat=_quat(item, scene))
-        host.attach(child, prefix=f"{item.name}/", frame=frame)
+        with captured_warnings():  # of options that differ; compiling repeats them
+            host.attach(child, prefix=f"{item.name}/", frame=frame)
     return host
 
 

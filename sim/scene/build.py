@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import name_of
+from ...models import captured_warnings, name_of
 from ..clip import Clip
 from ..control import is_position_servo, why_not_controllable
 from ..engines.interface import Array, Drive, Role, State, Wrench
@@ -28,7 +29,8 @@ class Setup:
     """A scene resolved against its models; the plan decides how to compute it.
 
     ``model`` has the scene's switches applied, ``as_filed`` has none of them. ``coupled`` names joints that
-    follow a keyed joint through an equality of the model.
+    follow a keyed joint through an equality of the model, ``overruled`` options of further models that
+    differ from those of the first.
     """
 
     scene: Scene
@@ -42,6 +44,7 @@ class Setup:
     servo: dict[int, Callable[[Array], Array]]
     wrenches: tuple[Wrench, ...]
     state0: State
+    overruled: tuple[str, ...]
 
 
 def build(scene: Scene) -> Setup:
@@ -58,9 +61,9 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     if spec is None:
         return None, mistakes + _law(scene)
     try:
-        model = spec.compile()
+        _compile(spec)
         name_everything(spec)
-        model = spec.compile()
+        model, overruled = _compile(spec)
     except ValueError as e:
         return None, [*mistakes, Mistake(("models",), f"the models do not fit together: {e}")]
     mistakes += _law(scene)
@@ -84,15 +87,29 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     keyed = np.asarray(roles[model.dof_jntid] == Role.KEYED)
     prescribed = prescribed_bodies(model, keyed)
     exclude_prescribed(spec, model, prescribed)
-    as_filed, model = model, spec.compile()
+    as_filed, model = model, _compile(spec)[0]
     clip = Clip(model, clip.tracks, clip.q0)
     _switches(scene, model)
     _silence_equalities(model, prescribed, roles)
     drives, servo, wrong = _drives(scene, model, roles, found, clip)
     if wrong:
         return None, wrong
-    state0 = _start_on_keys(scene, model, clip, state0)
-    return Setup(scene, model, as_filed, roles, clip, found, coupled, drives, servo, wrenches, state0), []
+    state0 = _start_on_keys(scene, model, roles, clip, state0)
+    setup = Setup(
+        scene, model, as_filed, roles, clip, found, coupled, drives, servo, wrenches, state0, overruled
+    )
+    return setup, []
+
+
+def _compile(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[str, ...]]:
+    """The compiled model, and the options that the first model's overrule in the others."""
+    with captured_warnings(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")  # the binding repeats MuJoCo's messages, with their details
+        model = spec.compile()
+    messages = [str(w.message) for w in caught]
+    lines = [line for m in messages if m.startswith("Attach conflict") for line in m.split("\n")[1:]]
+    names = dict.fromkeys(line.partition(":")[0] for line in lines if line)
+    return model, tuple(n for n in names if n != "integrator")
 
 
 def _law(scene: Scene) -> list[Mistake]:
@@ -189,7 +206,9 @@ def _wrong_width(model: mujoco.MjModel, joint: int, word: str, got: int) -> str:
     return f"a {name} joint's {word} is {width} number{'s' * (width > 1)}{meaning}, got {got}"
 
 
-def _start_on_keys(scene: Scene, model: mujoco.MjModel, clip: Clip, state0: State) -> State:
+def _start_on_keys(
+    scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], clip: Clip, state0: State
+) -> State:
     """Joints with keys start on them, tracked ones unless the scene gives them a state of their own."""
     motion = clip.evaluate(0.0)
     q, v = state0.q.copy(), state0.v.copy()
@@ -197,6 +216,8 @@ def _start_on_keys(scene: Scene, model: mujoco.MjModel, clip: Clip, state0: Stat
     joints = Names(model, "joint").ids
     for name in {*scene.initial.position, *scene.initial.velocity}:
         joint = joints[name]
+        if roles[joint] == Role.KEYED:
+            continue
         iq, iv = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         nq, nv = _width(model, joint, "position"), _width(model, joint, "velocity")
         if name in scene.initial.position:
