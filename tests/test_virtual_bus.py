@@ -68,14 +68,15 @@ def memory(bus: VirtualBus, baud: int = 1_000_000) -> Lane:
     return Lane(port, bus, bus.advance)
 
 
-@pytest.fixture(params=["memory", "pty"])
-def lane(request, monkeypatch) -> Iterator[Callable[..., Lane]]:
-    """Makes a lane of servos; the pseudo-terminal is opened by the SDK's own PortHandler.
+@pytest.fixture(autouse=True)
+def patience(monkeypatch) -> None:
+    """In real time the SDK's 34 ms are too short on a machine that tests other things meanwhile."""
+    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 100)
 
-    In real time the SDK's patience of 34 ms is too short for a machine that tests other things meanwhile.
-    """
-    if request.param == "pty":
-        monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 100)
+
+@pytest.fixture(params=["memory", "pty"])
+def lane(request) -> Iterator[Callable[..., Lane]]:
+    """Makes a lane of servos; the pseudo-terminal is opened by the SDK's own PortHandler."""
     cleanup: list[Callable[[], None]] = []
 
     def make(chain: list[VirtualServo], **options: Any) -> Lane:

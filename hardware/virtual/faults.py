@@ -21,8 +21,9 @@ class WireFault:
     """Packets that suffer on the wire.
 
     Args:
-        kind: lost (never arrives), late (by `delay`), truncated (its end is missing), corrupted (a flipped
-            bit), duplicated (comes twice) or noise (stray bytes before it).
+        kind: lost (never arrives), late (by `delay`; a late instruction holds the host up as well),
+            truncated (its end is missing), corrupted (a flipped bit), duplicated (comes twice) or noise
+            (stray bytes before it).
         probability: Of each packet that matches.
         direction: Packets to the servos, from them, or both. A lost instruction is heard by no servo; a
             lost status was heard by the other servos, so that a chain of replies goes on.

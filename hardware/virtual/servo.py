@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from math import inf
 
 from ..errors import HardwareError
-from ..packets import ALERT, BROADCAST, MAX_ID, Instruction, Packet, StatusError, status
+from ..packets import ALERT, BROADCAST, MAX_ID, Packet, StatusError
 from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register, control_table
 from ..tables.rows import POSITION, VELOCITY
 from . import drive as d
 from .drive import PERIOD, Drive, within_one_turn
+from .instructions import execute
 from .mapping import counts, report, settings
 from .memory import Memory
 from .motor import MOTORS, Gear, Motor, Plant
@@ -96,10 +97,10 @@ class VirtualServo:
         self._periods = 0
         self._boot_until = -inf
         self._fed = 0.0
-        self._registered: tuple[int, bytes] | None = None
+        self._registered: tuple[int, bytes, bool] | None = None
         self._backup: bytes | None = None
         self._fresh = -1.0
-        self._firmware = firmware or self.table.fast_read_firmware or 45
+        self.firmware = firmware or self.table.fast_read_firmware or 45
         self._factory()
         self.memory.put("id", id)
         self.memory.put("baud_rate", self._baud_value(baud))
@@ -152,12 +153,12 @@ class VirtualServo:
     @property
     def reads_fast(self) -> bool:
         """Whether the firmware answers fast sync and bulk reads."""
-        return self._firmware >= (self.table.fast_read_firmware or 45)
+        return self.firmware >= (self.table.fast_read_firmware or 45)
 
     def revive(self) -> None:
         """Power comes back after a dead time."""
         self.dead = False
-        self._reboot()
+        self.reboot()
 
     # Time.
 
@@ -225,7 +226,7 @@ class VirtualServo:
             self.memory.put(row.name, row.default or 0)
         if self.table["velocity_limit"].default is None:
             self.memory.put("velocity_limit", round(self.drive.motor.no_load_speed / VELOCITY))
-        self.memory.put("firmware_version", self._firmware)
+        self.memory.put("firmware_version", self.firmware)
 
     def _power_on(self) -> None:
         """RAM as after power-on: turns are lost, goals are where the servo is."""
@@ -257,7 +258,8 @@ class VirtualServo:
         self._apply_settings()
         self.drive.hold()
 
-    def _reboot(self) -> None:
+    def reboot(self) -> None:
+        """Restart: RAM is as after power-on, errors are forgotten, nothing is heard for the boot time."""
         self._power_on()
         self._boot_until = self.time + self.quirks.boot_time
 
@@ -296,7 +298,7 @@ class VirtualServo:
                 self.drive.plan()
         self._apply_settings()
 
-    # Instructions.
+    # What instructions do.
 
     def execute(self, packet: Packet) -> Packet | None:
         """Carry out an instruction for this servo; the reply, or None when there is none.
@@ -304,42 +306,10 @@ class VirtualServo:
         Sync and bulk instructions, whose replies form a chain, are the bus's; it calls `write` and
         `reply_to_read`.
         """
-        own = self.id
-        silent = packet.id != own
-        shadow = silent and packet.id != BROADCAST
-        error, data = self._do(packet, shadow)
-        level = self.memory.get("status_return_level")
-        if packet.instruction == Instruction.PING:
-            return None if shadow else status(own, self._error_byte(StatusError.NONE), data)
-        wanted = level == 2 or (level == 1 and packet.instruction == Instruction.READ)
-        return status(own, self._error_byte(error), data) if wanted and not silent else None
+        return execute(self, packet)
 
-    def _do(self, packet: Packet, shadow: bool) -> tuple[StatusError, bytes]:
-        params = packet.params
-        none = StatusError.NONE
-        match packet.instruction:
-            case Instruction.PING:
-                return none, bytes(self.memory.bytes[0:2]) + bytes((self._firmware,))
-            case Instruction.READ if len(params) == 4:
-                return self.read(_word(params, 0), _word(params, 2))
-            case Instruction.WRITE if len(params) >= 2:
-                return self.write(_word(params, 0), params[2:], shadow=shadow), b""
-            case Instruction.REG_WRITE if len(params) >= 2:
-                return self._register(_word(params, 0), params[2:]), b""
-            case Instruction.ACTION:
-                return self._action(), b""
-            case Instruction.REBOOT:
-                self._reboot()
-                return none, b""
-            case Instruction.CLEAR:
-                return self._clear(params), b""
-            case Instruction.FACTORY_RESET if len(params) == 1:
-                return self._factory_reset(params[0], packet.id == BROADCAST), b""
-            case Instruction.BACKUP:
-                return self._back_up(params), b""
-        return StatusError.INSTRUCTION, b""
-
-    def _error_byte(self, error: StatusError) -> int:
+    def error_byte(self, error: StatusError) -> int:
+        """Error byte of a reply: the number, and the alert bit while a hardware error is latched."""
         return error | (ALERT if self._latched else 0)
 
     def _refresh(self) -> None:
@@ -357,7 +327,7 @@ class VirtualServo:
         if self.memory.get("status_return_level") == 0:
             return None
         error, data = self.read(address, length)
-        return self._error_byte(error), data
+        return self.error_byte(error), data
 
     def write(self, address: int, data: bytes, *, shadow: bool = False) -> StatusError:
         """Write as the host does: all of the registers or none; the error that it is answered."""
@@ -448,25 +418,25 @@ class VirtualServo:
         if name == active and self.drive.settings.torque:
             self.drive.plan()
 
-    def _register(self, address: int, data: bytes) -> StatusError:
+    def register(self, address: int, data: bytes, *, shadow: bool = False) -> StatusError:
+        """Keep a write until the action comes."""
         error, _ = self.memory.parse(address, data)
         if not error:
-            self._registered = (address, data)
+            self._registered = (address, data, shadow)
             self.memory.put("registered_instruction", 1)
         return error
 
-    def _action(self) -> StatusError:
+    def act(self) -> StatusError:
+        """Do the write that was registered."""
         if self._registered is None:
             return StatusError.INSTRUCTION
-        address, data = self._registered
+        address, data, shadow = self._registered
         self._registered = None
         self.memory.put("registered_instruction", 0)
-        return self.write(address, data)
+        return self.write(address, data, shadow=shadow)
 
-    def _clear(self, params: bytes) -> StatusError:
-        """Clear multi-turn information; the servo must stand still."""
-        if params != b"\x01\x44\x58\x4c\x22":
-            return StatusError.DATA_RANGE
+    def clear_turns(self) -> StatusError:
+        """Bring the present position back into one turn; the servo must stand still."""
         if self.get("moving"):
             return StatusError.RESULT_FAIL
         self._reset_turns()
@@ -475,32 +445,28 @@ class VirtualServo:
         self.drive.hold()
         return StatusError.NONE
 
-    def _factory_reset(self, option: int, broadcast: bool) -> StatusError:
-        if option not in (0xFF, 0x01, 0x02) or (option == 0xFF and broadcast):
-            return StatusError.DATA_RANGE
-        keep = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}[option]
+    def factory_reset(self, keep: tuple[str, ...]) -> StatusError:
+        """Factory values but for the registers to keep, then a reboot."""
         kept = {name: self.memory.get(name) for name in keep}
         self._factory()
         for name, raw in kept.items():
             self.memory.put(name, raw)
-        self._reboot()
+        self.reboot()
         return StatusError.NONE
 
-    def _back_up(self, params: bytes) -> StatusError:
-        if len(params) != 5 or params[1:] != b"CTRL" or params[0] not in (1, 2):
-            return StatusError.DATA_RANGE
-        if self.drive.settings.torque or (params[0] == 2 and self._backup is None):
+    def store(self) -> StatusError:
+        """Keep the EEPROM in the backup area; torque must be off."""
+        if self.drive.settings.torque:
             return StatusError.RESULT_FAIL
-        if params[0] == 1:
-            self._backup = self.memory.eeprom()
-            if "backup_ready" in self.table:
-                self.memory.put("backup_ready", 1)
-        else:
-            assert self._backup is not None
-            self.memory.bytes[:FIRST_RAM_ADDRESS] = self._backup
-            self._reboot()
+        self._backup = self.memory.eeprom()
+        if "backup_ready" in self.table:
+            self.memory.put("backup_ready", 1)
         return StatusError.NONE
 
-
-def _word(data: bytes, place: int) -> int:
-    return data[place] | data[place + 1] << 8
+    def restore(self) -> StatusError:
+        """Bring the EEPROM back from the backup area and reboot; torque must be off."""
+        if self.drive.settings.torque or self._backup is None:
+            return StatusError.RESULT_FAIL
+        self.memory.bytes[:FIRST_RAM_ADDRESS] = self._backup
+        self.reboot()
+        return StatusError.NONE
