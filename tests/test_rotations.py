@@ -44,9 +44,9 @@ def test_quaternion_algebra_agrees_with_scipy(seed):
     x = np.random.default_rng(seed).normal(size=(5, 3))
     assert np.allclose(angle_between(rot.multiply(p, q), (P * Q).as_quat(scalar_first=True)), 0, atol=1e-14)
     assert np.allclose(rot.rotate(p, x), P.apply(x), rtol=0, atol=1e-14)
-    assert np.allclose(rot.to_matrix(p), P.as_matrix(), rtol=0, atol=1e-15)
+    assert np.allclose(rot.to_matrix(p), P.as_matrix(), rtol=0, atol=4e-15)
     assert np.allclose(angle_between(rot.from_matrix(P.as_matrix()), p), 0, atol=1e-14)
-    assert np.allclose(rot.multiply(p, rot.conjugate(p)), [1, 0, 0, 0], rtol=0, atol=1e-15)
+    assert np.allclose(rot.multiply(p, rot.conjugate(p)), [1, 0, 0, 0], rtol=0, atol=4e-15)
     assert np.allclose(rot.log(p), P.as_rotvec(), rtol=0, atol=1e-14)
 
 
@@ -57,7 +57,7 @@ def test_exp_and_log_undo_each_other_near_identity_and_near_half_a_turn(seed, an
     q = rot.exp(phi)
     assert np.linalg.norm(q) == pytest.approx(1, abs=1e-15)
     np.testing.assert_allclose(rot.to_matrix(q), oracle.matrix(phi), rtol=0, atol=4e-15)
-    np.testing.assert_allclose(rot.log(q), phi, rtol=1e-14, atol=1e-15 * angle)
+    np.testing.assert_allclose(rot.log(q), phi, rtol=1e-14, atol=1e-15 * angle + 1e-300)
     np.testing.assert_array_equal(rot.log(-q), rot.log(q))
 
 
@@ -183,7 +183,8 @@ def test_each_kind_is_as_smooth_as_it_promises(keyframes, kind):
     curve = keyed_rotation(*keyframes, kind=kind)
     left, right = curve(curve.times, left=True), curve(curve.times)
     speed, push = speed_scale(curve)
-    assert np.all(angle_between(left.q, right.q) < 1e-14)
+    swing = 1 + speed * (curve.end - curve.start)
+    assert np.all(angle_between(left.q, right.q) < 1e-14 * swing)
     if kind in ("auto", "clamped"):  # held ends included
         np.testing.assert_allclose(left.v, right.v, rtol=0, atol=1e-12 * speed)
     if kind in ("natural", "clamped"):
@@ -201,7 +202,7 @@ def test_a_loop_repeats_and_is_as_smooth_across_its_seam_as_at_a_key(keyframes, 
     period = curve.end - curve.start
     left, right = curve(curve.end, left=True), curve(curve.end)
     speed, push = speed_scale(curve)
-    assert angle_between(left.q, right.q) < 1e-13
+    assert angle_between(left.q, right.q) < 1e-14 * (1 + speed * period)
     np.testing.assert_allclose(left.v, right.v, rtol=0, atol=1e-12 * speed)
     if kind == "natural":
         np.testing.assert_allclose(left.a, right.a, rtol=0, atol=1e-10 * push)
