@@ -29,6 +29,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.hardware import packets as p
 from pantograph.hardware.errors import BusError, HardwareError
+from pantograph.hardware.packets import Packet
 from pantograph.hardware.virtual import (
     CablePull,
     FaultPlan,
@@ -41,7 +42,7 @@ from pantograph.hardware.virtual import (
     WireFault,
     serve,
 )
-from serial import SerialException
+from serial import Serial, SerialException
 
 TORQUE, LED, GOAL, PRESENT = 64, 65, 116, 132
 SDK = PacketHandler(2.0)
@@ -71,7 +72,7 @@ def memory(bus: VirtualBus, baud: int = 1_000_000) -> Lane:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch) -> None:
     """In real time the SDK's 34 ms are too short on a machine that tests other things meanwhile."""
-    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 100)
+    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 60)
 
 
 @pytest.fixture(params=["memory", "pty"])
@@ -638,6 +639,25 @@ def test_no_params_break_a_bus(servo, instruction, params):
     there = {s.id for s in bus.servos if s.baud == 1_000_000}
     if len(there) == 2:
         assert {r.id for r in replies(bus, p.ping())} == there
+
+
+def test_a_rate_that_no_constant_names():
+    """4.5 Mbit/s is a custom rate for the terminal, known to the servos."""
+    with (
+        serve(VirtualBus(servos(1, baud=4_500_000))) as server,
+        Serial(server.port, 4_500_000, timeout=1) as port,
+    ):
+        port.write(p.ping(1).encode())
+        assert Packet.decode(port.read(14)).id == 1
+        port.baudrate = 4_000_000
+        port.timeout = 0.2
+        port.write(p.ping(1).encode())
+        assert port.read(14) == b""
+
+
+def test_a_link_into_nowhere_is_refused(tmp_path):
+    with pytest.raises(BusError, match="nowhere"):
+        PtyServer(VirtualBus([]), link=tmp_path / "nowhere" / "tty")
 
 
 def test_terminal_needs_no_echo_and_keeps_control_bytes():

@@ -7,8 +7,10 @@ low-latency ioctl do not exist on a pseudo-terminal. Wire time is kept in the le
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
+import sys
 import termios
 import threading
 import time
@@ -22,6 +24,7 @@ from .bus import VirtualBus
 
 TICK = 2e-3  # s between looks at the clock while no byte comes
 
+_TCGETS2 = 0x802C542A  # asm-generic/ioctls.h: struct termios2, output speed in its last four bytes
 _RATES = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
@@ -106,8 +109,11 @@ class PtyServer:
         if self._link is not None:
             if self._link.exists() and not self._link.is_symlink():
                 raise BusError(f"{self._link} exists and is no link; choose another name for the serial port")
-            self._link.unlink(missing_ok=True)
-            self._link.symlink_to(self._name)
+            try:
+                self._link.unlink(missing_ok=True)
+                self._link.symlink_to(self._name)
+            except OSError as error:
+                raise BusError(f"cannot make the link {self._link}: {error.strerror}") from error
 
     def _unplug(self) -> None:
         if self._master >= 0:
@@ -148,6 +154,10 @@ class PtyServer:
                 self._plug()
 
     def _baud(self) -> int:
+        """Rate that the other side has set [bit/s]; on Linux custom rates too."""
+        if sys.platform == "linux":
+            state = fcntl.ioctl(self._slave, _TCGETS2, bytes(44))
+            return int.from_bytes(state[40:44], sys.byteorder) or 1
         return _RATES.get(termios.tcgetattr(self._slave)[5], 0) or 1
 
     def _read(self) -> bytes:
