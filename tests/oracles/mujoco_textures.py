@@ -42,7 +42,8 @@ def model_of(folder: Path, kind: str, size: str, texture: str, uniform: str) -> 
     """The geom under even light, with a camera on each side."""
     source = {
         "2d": f'<texture name="t" type="2d" file="{folder}/flat.png"/>',
-        "cube": f'<texture name="t" type="cube" file="{folder}/cube.png" gridsize="6 1" gridlayout="RLUDFB"/>',
+        "cube": f'<texture name="t" type="cube" file="{folder}/cube.png" gridsize="6 1" '
+        'gridlayout="RLUDFB"/>',
     }[texture]
     cameras = [
         f'<camera name="{view}" pos="{pos}" xyaxes="{xy}" fovy="25"/>' for view, (pos, xy) in VIEWS.items()
