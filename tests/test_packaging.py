@@ -1,0 +1,47 @@
+"""What is installed is what is in the folders, and imports go one way."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text())
+FOLDERS = ("models", "sim", "controllers", "hardware")
+
+
+def test_every_folder_with_code_or_data_is_listed_as_a_package():
+    on_disk = {
+        "pantograph." + ".".join(folder.relative_to(ROOT).parts)
+        for top in FOLDERS
+        for folder in [ROOT / top, *(ROOT / top).rglob("*/")]
+        if any(f.suffix in (".py", ".xml", ".toml") for f in folder.iterdir() if f.is_file())
+    }
+    assert on_disk == set(CONFIG["tool"]["setuptools"]["packages"])
+
+
+@pytest.mark.parametrize("heavy", ["torch", "casadi", "llvmlite", "pyrender", "serial", "av", "matplotlib"])
+def test_the_front_door_imports_nothing_heavy(heavy):
+    code = f"import sys, pantograph.sim; sys.exit({heavy!r} in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_versions_that_tests_run_with_satisfy_what_the_package_asks_for():
+    from packaging.requirements import Requirement
+
+    pinned = dict(
+        line.split("==")
+        for line in (ROOT / ".ci" / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    )
+    extras = CONFIG["project"]["optional-dependencies"]["torch"]
+    groups = CONFIG["dependency-groups"]["test"]
+    for line in [*CONFIG["project"]["dependencies"], *extras, *groups]:
+        requirement = Requirement(line)
+        versions = {k.lower(): v for k, v in pinned.items()}
+        assert requirement.name.lower() in versions, f"{requirement.name} is not pinned"
+        assert requirement.specifier.contains(versions[requirement.name.lower()])
