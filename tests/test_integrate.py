@@ -184,6 +184,13 @@ class TestTolerance:
             evaluations.append(solution.stats.evaluations)
         assert max(evaluations) < 1.3 * min(evaluations)
 
+    @pytest.mark.parametrize("name", PAIRS)
+    def test_a_sudden_kick_costs_few_rejections(self, name):
+        """At t = 1 f jumps and its time scale shrinks a thousand times: a good controller is quick to follow."""
+        problem = ODE(lambda t, y: np.array([1.0 if t < 1 else 1e3 * np.cos(1e3 * t)]), 1)
+        stats = solve(problem, (0, 1.02), [0.0], method=name, rtol=1e-6).stats
+        assert 2 < stats.rejected < 40
+
     def test_stiff_problem_is_finished_within_the_stability_limit(self):
         """x' = -1e4 (x - cos t): DOPRI5 is stable up to |h lambda| = 3.3, which sets its number of steps."""
         problem = ODE(lambda t, y: -1e4 * (y - np.cos(t)), 1)
@@ -261,6 +268,13 @@ class TestTime:
             with pytest.raises(EngineError, match="outside"):
                 solution.interpolant(5.0)
 
+    @pytest.mark.parametrize("name", METHODS)
+    def test_quaternions_between_the_steps_are_unit_too(self, name):
+        problem = mujoco_problem(mujoco.MjModel.from_xml_string(FREE_BODY))
+        start = np.array([0, 0, 0, 1, 0, 0, 0, 0.3, 0, -1, *FREE_RATES])
+        y = solve(problem, (0, 1), start, method=name, step=0.2, t_eval=np.linspace(0, 1, 24)).y
+        np.testing.assert_allclose(np.linalg.norm(y[:, 3:7], axis=1), 1, atol=4e-16)
+
     def test_the_last_fixed_step_is_cut(self):
         solution = solve(SWING, (0, 1), SWING_START, method="rk4", step=0.3)
         np.testing.assert_allclose(solution.t, [0, 0.3, 0.6, 0.9, 1.0], rtol=1e-15)
@@ -284,11 +298,11 @@ class TestFailure:
 
     def test_blow_up(self):
         """y' = y^2, y(0) = 1 leaves every bound at t = 1."""
-        problem = ODE(lambda t, y: y * y, 1)
-        adaptive = solve(problem, (0, 2), [1.0], rtol=1e-8)
-        assert adaptive.status == Status.STEP_TOO_SMALL
+        problem = ODE(lambda t, y: np.array([0.1, y[1] ** 2, -0.1]), 3)
+        adaptive = solve(problem, (0, 2), [1.0, 1.0, 1.0], rtol=1e-8)
+        assert adaptive.status == Status.STEP_TOO_SMALL and "component 1 " in adaptive.message
         assert adaptive.t[-1] == pytest.approx(1, abs=1e-6)
-        fixed = solve(problem, (0, 2), [1.0], method="rk4", step=0.01)
+        fixed = solve(problem, (0, 2), [1.0, 1.0, 1.0], method="rk4", step=0.01)
         assert fixed.status == Status.DIVERGED and 1 < fixed.t[-1] < 1.2
 
     def test_not_finite_at_the_start(self):
