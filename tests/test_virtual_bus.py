@@ -343,7 +343,7 @@ def replies(bus: VirtualBus, packet: p.Packet, baud: int = 1_000_000) -> list[p.
 
 
 def test_replies_come_in_the_order_of_the_request():
-    bus = VirtualBus(servos(5))
+    bus = VirtualBus(servos(5)[::-1])
     assert [r.id for r in replies(bus, p.sync_read(PRESENT, 4, [4, 1, 3]))] == [4, 1, 3]
     assert [r.id for r in replies(bus, p.bulk_read([(5, 7, 1), (2, 7, 1)]))] == [5, 2]
     assert [r.id for r in replies(bus, p.ping())] == [1, 2, 3, 4, 5]
@@ -357,6 +357,8 @@ def test_old_firmware_does_not_know_fast_reads():
     bus = VirtualBus([VirtualServo("xm430-w350", 1, baud=1_000_000, firmware=44)])
     assert replies(bus, p.sync_read(7, 1, [1], fast=True)) == []
     assert len(replies(bus, p.sync_read(7, 1, [1]))) == 1
+    unknown = VirtualBus([VirtualServo("mx-64", 1, baud=1_000_000)])
+    assert replies(unknown, p.sync_read(7, 1, [1], fast=True)) == []
 
 
 def test_two_servos_with_one_id_garble_each_other():
@@ -485,6 +487,14 @@ def test_wire_faults(lane, kind, direction, outcome):
     there.wait(max(0.0, 0.8 - there.bus.time))
     assert SDK.read1ByteTxRx(there.port, 1, LED) == (int(done), COMM_SUCCESS, 0)
     assert SDK.ping(there.port, 2)[1] == COMM_SUCCESS
+
+
+def test_duplicated_packets_come_twice():
+    bus = VirtualBus(servos(1), faults=FaultPlan((WireFault("duplicated", 1.0, "status"),)))
+    assert [r.id for r in replies(bus, p.ping(1))] == [1, 1]
+    bus = VirtualBus(servos(1), faults=FaultPlan((WireFault("duplicated", 1.0, "instruction"),)))
+    assert [r.id for r in replies(bus, p.ping(1))] == [1, 1]
+    assert bus.ledger.instructions == 2
 
 
 def test_a_late_reply_answers_the_wrong_question():

@@ -3,6 +3,8 @@
 Values were read from the sources of the ROBOTIS e-manual (github.com/ROBOTIS-GIT/emanual, docs/en/dxl/),
 which are the pages cited. `velocity=None`: no version of the page with the present velocity limit was at
 hand (older ones state higher limits, from before the limits were revised), so the default is left open.
+Startup Configuration and Backup Ready are rows where a page lists them; the page of xl330-m077 at hand is
+older than those of its family and was completed from them.
 """
 
 from __future__ import annotations

@@ -152,8 +152,9 @@ class VirtualServo:
 
     @property
     def reads_fast(self) -> bool:
-        """Whether the firmware answers fast sync and bulk reads."""
-        return self.firmware >= (self.table.fast_read_firmware or 45)
+        """Whether the firmware answers fast sync and bulk reads; where no source says, it does not."""
+        first = self.table.fast_read_firmware
+        return first is not None and self.firmware >= first
 
     def revive(self) -> None:
         """Power comes back after a dead time."""
