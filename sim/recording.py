@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import os
+import struct
 import tempfile
+import uuid
 import zipfile
+import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +26,20 @@ Array = NDArray[np.float64]
 
 MAGIC = "pantograph recording"
 VERSION = 1
+
+# what readers of zip, deflate and npy raise on bytes that make no sense
+_TORN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    ValueError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+)
 
 
 @dataclass(frozen=True)
@@ -105,15 +122,14 @@ class Recording:
     def save(self, path: str | Path) -> Path:
         """Write the recording to one file; whole or not at all. Raises RecordingError if it cannot."""
         path = Path(path)
+        if path.is_dir():
+            raise RecordingError(f"cannot write {path}: it is a folder; name a file in it")
         arrays, header = _pack(self)
         header |= {"magic": MAGIC, "version": VERSION}
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        except OSError as e:
-            raise RecordingError(f"cannot write {path}: {e.strerror}") from None
-        try:
-            with os.fdopen(handle, "wb") as f:
+            with temporary.open("xb") as f:
                 np.savez_compressed(
                     f,
                     allow_pickle=False,
@@ -121,10 +137,12 @@ class Recording:
                     model_bytes=np.frombuffer(self.model_bytes, dtype=np.uint8),
                     **arrays,
                 )
-            Path(temporary).replace(path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+            temporary.replace(path)
+        except OSError as e:
+            raise RecordingError(f"cannot write {path}: {e.strerror or e}") from None
+        finally:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
         return path
 
 
@@ -146,7 +164,7 @@ def load(path: str | Path) -> Recording:
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, KeyError) as e:
+    except _TORN as e:
         raise RecordingError(f"{path} is torn: {e}; run its scene again") from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
@@ -154,13 +172,12 @@ def load(path: str | Path) -> Recording:
         header = {}
     if not isinstance(header, dict) or header.get("magic") != MAGIC:
         raise RecordingError(f"{path} is a .npz file, but no recording of Pantograph")
-    if header["version"] > VERSION:
-        raise RecordingError(
-            f"{path} is of format {header['version']}; this Pantograph reads up to {VERSION}: update it"
-        )
+    version = header.get("version")
+    if version != VERSION:
+        raise RecordingError(f"{path} is of format {version}; this Pantograph reads {VERSION}: update it")
     try:
         return _unpack(arrays, header)
-    except (KeyError, TypeError) as e:
+    except (KeyError, TypeError, AttributeError, ValueError) as e:
         raise RecordingError(f"{path} lacks a part of a recording: {e}") from None
 
 
