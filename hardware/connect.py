@@ -16,8 +16,8 @@ from .virtual import NO_FAULTS, FaultPlan, Quirks, Timing, VirtualBus, VirtualSe
 
 Array = NDArray[np.float64]
 
-_REAL_MARGIN = 8e-3  # s beyond the wire's time: scheduling of host and adapter
-_TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind it
+REAL_MARGIN = 8e-3  # s beyond the wire's time: scheduling of host and adapter
+TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind it
 
 
 def rest_pose(rig: Rig) -> Array:
@@ -84,5 +84,5 @@ def connect(
     latency = latency_of(name)
     opened, clock = open_port(name, rig.baud)
     terminal = Path(name).resolve().parent.name == "pts"
-    margin = _TERMINAL_MARGIN if terminal else _REAL_MARGIN
+    margin = TERMINAL_MARGIN if terminal else REAL_MARGIN
     return Driver(opened, clock, margin=margin, latency=latency.seconds, label=rig.label), latency.note

@@ -111,7 +111,7 @@ class Verdict:
 def check_motion(
     motion: Motion, mapping: Mapping, servos: Bounds, joints: JointBounds, loads: Loads | None = None
 ) -> Verdict:
-    """Hold a motion against every limit of joints and servos; without `loads`, torque is left out, and noted."""
+    """Hold a motion against every limit of joints and servos; torque is left out without `loads`."""
     t = motion.dense()
     q, v = motion.at(t)
     s = mapping.servo(q)

@@ -1,4 +1,4 @@
-"""The part of a motion that a rig makes: its joints over time, by cubic Hermite curves between the samples."""
+"""The part of a motion that a rig makes: its joints over time, cubic Hermite curves between the samples."""
 
 from __future__ import annotations
 

@@ -48,8 +48,8 @@ class RigFault(HardwareError):
 class Ready:
     """A rig that was checked and prepared.
 
-    block: feedback of all servos in one read; present (ns,) [rad]; changed: EEPROM settings that were rewritten;
-    torque: whether the servos held themselves already.
+    block: feedback of all servos in one read; present (ns,) [rad]; changed: EEPROM settings that were
+    rewritten; torque: whether the servos held themselves already.
     """
 
     block: Block
@@ -65,7 +65,7 @@ def error_names(bits: int) -> str:
 
 
 def scan(driver: Driver, rig: Rig, *, take_over: bool = False) -> bool:
-    """Hold the rig file against the servos that are there; RigFault with every mismatch. Whether torque is on."""
+    """Whether torque is on; RigFault with every mismatch between the rig file and the servos found."""
     wrong: list[tuple[int, str]] = []
     on = []
     for item in rig.servos:
@@ -94,7 +94,7 @@ def _mismatches(driver: Driver, rig: Rig, id: int, found: Found, take_over: bool
     if error := driver.read_raw(id, "hardware_error_status"):
         yield f"{label} reports a hardware error: {error_names(error)}; find the cause, then reboot it"
     if driver.read_raw(id, "torque_enable") and not take_over:
-        yield f"{label} has its torque on already: another program may hold it; take_over (--take-over) accepts"
+        yield f"{label} has its torque on already, perhaps by another program; --take-over accepts that"
     volts, low, high = (
         driver.read(id, n) for n in ("present_input_voltage", "min_voltage_limit", "max_voltage_limit")
     )
@@ -105,7 +105,7 @@ def _mismatches(driver: Driver, rig: Rig, id: int, found: Found, take_over: bool
         yield f"{label} has {hot:.0f} degC, its limit is {limit:.0f}; let it cool down"
     if driver.read_raw(id, "secondary_id") in rig.ids:
         shadow = driver.read_raw(id, "secondary_id")
-        yield f"{label} listens to ID {shadow} as well (secondary ID), which is {rig.label(shadow)}; set it to 255"
+        yield f"{label} has the secondary ID {shadow}, which is {rig.label(shadow)}; set it to 255"
 
 
 def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torque: bool) -> Ready:
@@ -122,7 +122,7 @@ def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torqu
                 if torque:
                     raise RigFault(
                         "prepare",
-                        f"{rig.label(id)} has {name} {found}, {raw} is needed, and EEPROM is locked while torque "
+                        f"{rig.label(id)} has {name} {found}, {raw} is needed; EEPROM is locked while torque "
                         "is on: release it first ('pantograph servo stop --limp')",
                         servo=id,
                     )
@@ -147,7 +147,7 @@ def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torqu
         id = rig.ids[int(np.argmax(np.abs(apart)))]
         raise RigFault(
             "prepare",
-            f"{rig.label(id)} is {np.max(np.abs(apart)):.3f} rad away from where the other servo of its joint "
+            f"{rig.label(id)} is {np.max(np.abs(apart)):.3f} rad from where the other servo of its joint "
             "puts it: they would fight; check direction and zero",
             servo=id,
         )
@@ -172,7 +172,7 @@ def _goal_to_present(driver: Driver, rig: Rig, id: int) -> float:
         at = driver.register(id, "present_position").to_si(raw)
         raise RigFault(
             "prepare",
-            f"{rig.label(id)} stands at {at:.3f} rad, its position limits are {low:.3f} to {high:.3f} rad: move it "
+            f"{rig.label(id)} stands at {at:.3f} rad, its limits are {low:.3f} to {high:.3f} rad: move it "
             f"inside by hand, or widen them ({e})",
             servo=id,
         ) from None

@@ -1,4 +1,4 @@
-"""The control loop: goals out at an absolute schedule, feedback in, and a fault as soon as one can be seen."""
+"""The control loop: goals out at an absolute schedule, feedback in, a fault as soon as it can be seen."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class Loop:
     ) -> None:
         """Stream target(t) (ns,) [rad] for t from 0 to `duration` [s]; a target of None ends it.
 
-        Cycle k is due at start + k * period whatever happened before: late ones are skipped, never made up for.
-        """
+        Cycle k is due at start + k * period whatever happened before: late ones are skipped, never made up
+        for."""
         clock, period = self.driver.clock, self.period
         start, k = clock.now(), 0
         last = ceil(duration / period - 1e-9) if np.isfinite(duration) else None
@@ -186,7 +186,7 @@ class Loop:
             id = self.rig.ids[i]
             raise RigFault(
                 phase,
-                f"{self.rig.label(id)} has {values[i, 1]:.0f} degC, close to the {self._too_hot[i] + _HOT:.0f} "
+                f"{self.rig.label(id)} has {values[i, 1]:.0f} degC, near the {self._too_hot[i] + _HOT:.0f} "
                 "at which it lets go: let it cool down",
                 servo=id,
             )

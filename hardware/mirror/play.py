@@ -26,7 +26,7 @@ Progress = Callable[[float], None]
 
 
 def judge(recording: Recording, rig: Rig) -> tuple[Motion, Verdict]:
-    """The rig's part of a recording, and whether the rig can make it. RigError when the model does not fit."""
+    """The rig's part of a recording, and whether the rig can make it; RigError when they do not fit."""
     model = recording.model
     check_model(rig, model)
     mapping = make_mapping(rig)
@@ -51,10 +51,10 @@ def mirror_recording(
     """Play a recording on a rig: judge it, then the safety contract, then stream it, then stop.
 
     ``slow`` slows the motion uniformly until it fits; ``port`` replaces the rig's ('virtual': servos in
-    memory, with ``paced`` as slow as real ones); ``bus`` are virtual servos of one's own. ``progress`` is told
-    the played time [s]. A fault or Ctrl-C during the motion ends in a report with that status.
-    Raises MotionRefused (with a verdict per joint) before anything moves, RigError for a rig that does not fit.
-    """
+    memory, with ``paced`` as slow as real ones); ``bus`` are virtual servos of one's own. ``progress`` is
+    told the played time [s]. A fault or Ctrl-C during the motion ends in a report with that status.
+    Raises MotionRefused (with a verdict per joint) before anything moves, RigError for a rig that does not
+    fit."""
     recording = load(recording) if isinstance(recording, str | Path) else recording
     rig = load_rig(rig) if isinstance(rig, str | Path) else rig
     motion, verdict = judge(recording, rig)

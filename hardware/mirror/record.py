@@ -17,6 +17,7 @@ from ..limits import Verdict
 from ..mapping import Mapping, indices
 from ..rig import Rig
 from ..virtual.motor import MOTORS
+from .contract import FEEDBACK
 from .loop import Log
 from .session import Outcome
 
@@ -39,8 +40,8 @@ class Tracking:
 class Timing:
     """How well the schedule was kept over the streaming cycles.
 
-    jitter: begun - due, 50th and 99th percentile and greatest [s]; histogram: (rate [Hz], cycles) of the rates
-    between two cycles; busy: median time from goal to feedback [s].
+    jitter: begun - due, 50th and 99th percentile and greatest [s]; histogram: (rate [Hz], cycles) of the
+    rates between two cycles; busy: median time from goal to feedback [s].
     """
 
     cycles: int
@@ -54,10 +55,10 @@ class Timing:
 class MirrorReport:
     """Result of mirroring.
 
-    status: 'done', 'interrupted' or 'fault' (then message, phase and servo say what); stop: how the rig was left;
-    unconfirmed: what could not be confirmed while stopping; slowed: how often slower the motion ran; t (n,) [s]
-    from the start of the stream, commanded and measured (n, nj): joints of the rig, NaN where no answer came;
-    recording: the rig's motion, None when nothing was streamed.
+    status: 'done', 'interrupted' or 'fault' (then message, phase and servo say what); stop: how the rig was
+    left; unconfirmed: what could not be confirmed while stopping; slowed: how often slower the motion ran;
+    t (n,) [s] from the start of the stream, commanded and measured (n, nj): joints of the rig, NaN where no
+    answer came; recording: the rig's motion, None when nothing was streamed.
     """
 
     status: str
@@ -131,7 +132,7 @@ def make_report(
     nj = len(mapping.joints)
     begun = np.array([log.begun[i] for i in rows])
     t = begun - begun[0] if len(rows) else np.zeros(0)
-    feedback = np.array([log.feedback[i] for i in rows]).reshape(len(rows), len(rig.ids), -1)
+    feedback = np.array([log.feedback[i] for i in rows]).reshape(len(rows), len(rig.ids), len(FEEDBACK))
     commanded = measured = np.zeros((0, nj))
     tracking: tuple[Tracking, ...] = ()
     recording = None
@@ -308,7 +309,7 @@ def _servo_torque(rig: Rig, load: Array) -> Array:
         table = control_table(s.model)
         motor = MOTORS[table.model]
         factor.append(motor.kt if table.has_current else motor.stall_torque)
-    return load * np.array(factor)
+    return np.asarray(load * np.array(factor), dtype=float)
 
 
 def _energies(model: mujoco.MjModel, q: Array, v: Array) -> tuple[Array, Array]:

@@ -24,9 +24,9 @@ _PEAK = 1.875  # greatest speed of a minimum-jerk motion over its mean
 class Outcome:
     """How a session went.
 
-    status: 'done', 'interrupted' or 'fault', with message, phase where it ended and servo; stop: what was done in
-    the end; unconfirmed: what could not be confirmed then; phases: when each began [s]; ready, log: of the loop.
-    """
+    status: 'done', 'interrupted' or 'fault', with message, phase where it ended and servo; stop: what was
+    done in the end; unconfirmed: what could not be confirmed then; phases: when each began [s]; ready, log:
+    of the loop."""
 
     status: str = "done"
     message: str = ""
@@ -67,9 +67,15 @@ class Session:
         self._torque = False
         self._now: Phase = "scan"
 
-    def run(self, first: Array, target: Callable[[float], Array | None], duration: float) -> Outcome:
+    def run(
+        self,
+        first: Array | Callable[[Array], Array],
+        target: Callable[[float], Array | None],
+        duration: float,
+    ) -> Outcome:
         """Bring the servos to `first` (ns,) [rad], then stream target(t); always stop as promised.
 
+        `first` may be a function of where the servos stand; a target of None ends the stream.
         A fault or Ctrl-C ends in an outcome; any other exception stops the rig and goes on to the caller.
         """
         out = self.outcome
@@ -77,7 +83,7 @@ class Session:
             self._start()
             assert self._loop is not None
             self._phase("ramp")
-            self.move(first, "ramp")
+            self.move(first(self._loop.present.copy()) if callable(first) else first, "ramp")
             self._phase("stream")
             self._loop.run(target, duration, "stream")
         except KeyboardInterrupt:
@@ -94,6 +100,12 @@ class Session:
             out.phase = self._now
         self._stop(sound=out.status != "fault")
         return out
+
+    @property
+    def goal(self) -> Array:
+        """Goal sent last (ns,) [rad]."""
+        assert self._loop is not None
+        return self._loop.goal
 
     def _record(self, e: Exception) -> None:
         """A fault, where it happened, naming who is concerned."""
@@ -142,7 +154,7 @@ class Session:
         loop.run(at, duration, phase)
 
     def _stop(self, *, sound: bool) -> None:
-        """The promised stop; `sound`: no servo is faulty. What fails in here is noted, and the rest goes on."""
+        """The promised stop; `sound`: no servo is faulty. What fails is noted, and the rest goes on."""
         out = self.outcome
         if not self._torque:
             out.stop = "nothing was given torque, nothing moved"
