@@ -1,7 +1,8 @@
 """Whole integrations with steps that follow a tolerance, emitted as IR; every lane keeps its own clock.
 
-Control of the steps as in `sim.integrate.control`: proportional-integral, h 0.9 err^(-0.7/k) err_before^(0.4/k)
-(Gustafsson; Hairer & Wanner II, IV.2); output at requested times by the method's continuous extension.
+Control of the steps as in `sim.integrate.control`, proportional-integral: h 0.9 err^(-0.7/k)
+err_before^(0.4/k) (Gustafsson; Hairer & Wanner II, IV.2); output at requested times by the method's
+continuous extension.
 """
 
 from __future__ import annotations
@@ -200,6 +201,8 @@ class _Integrator:
             first = 0 if self.method.fsal else 1
             for k in range(first, self.extra):
                 self.stage(self.stages + k, self.method.dense.A[k], h)
+            more = e.f("fadd", self.get("evaluations"), e.const(float(self.extra - first)))
+            self.set("evaluations", e.select(accept, more, self.get("evaluations")))
             with e.loop(e.lanes) as lane, repeat_while(e) as going:
                 time, waiting = self.next_time(lane, flags)
                 going(waiting)
@@ -220,15 +223,16 @@ class _Integrator:
         return time, e.emit(f"and i1 {both}, {accepted}")
 
     def write(self, lane: str, time: str) -> None:
-        """One state of one lane: x + h sum_i P_i(theta) k_i."""
+        """One state of one lane: y + h theta sum_i P_i(2 theta - 1) k_i (see `tableau.Dense`)."""
         e, s, nx = self.e, self.e.scalar(), self.shape.nx
         t = s.emit(f"load double, ptr {s.element(self.mem['t'], lane, 'double')}, align 8")
         h = s.emit(f"load double, ptr {s.element(self.mem['h'], lane, 'double')}, align 8")
         theta = s.f("fdiv", s.f("fsub", time, t), h)
+        x = s.f("fsub", s.f("fadd", theta, theta), s.const(1.0))
         weights = []
         for j, row in enumerate(self.method.dense.P):
             if row.any():
-                weights.append((j, s.f("fmul", s.polynomial([float(c) for c in row[::-1]], theta), theta)))
+                weights.append((j, s.f("fmul", s.polynomial([float(c) for c in row[::-1]], x), theta)))
         index = s.emit(f"load i64, ptr {s.element(self.index, lane, 'i64')}, align 8")
         row = s.emit(f"load i64, ptr {s.element(self.row, lane, 'i64')}, align 8")
         place = s.emit(f"add nsw i64 {s.emit(f'mul nsw i64 {row}, %count')}, {index}")
@@ -264,6 +268,9 @@ class _Integrator:
         """Steps up to `end`."""
         e, method = self.e, self.method
         self.rate(self.X, self.K[0])
+        sound = e.compare("oeq", self.get("status"), e.const(OK))
+        one_more = e.f("fadd", self.get("evaluations"), e.const(1.0))
+        self.set("evaluations", e.select(sound, one_more, self.get("evaluations")))
         with repeat_while(e) as going:
             active = self.active(end)
             going(any_lane(e, active))
@@ -311,9 +318,9 @@ class _Integrator:
 def adaptive_steps(name: str, method: Any, shape: Shape, lanes: int) -> str:
     """Integration to a tolerance, as IR.
 
-    `void name(n, periods, t0, t1, hold, rtol, atol, max_steps, x0, h0, controls..., p, p_state, t_eval, count,
-    first_eval, path, x1, stats)`: control periods of `hold` seconds; `path` receives the states at t_eval from
-    index `first_eval` on, `x1` the final states, `stats` the STATISTICS of every state.
+    `void name(n, periods, t0, t1, hold, rtol, atol, max_steps, x0, h0, controls..., p, p_state, t_eval,
+    count, first_eval, path, x1, stats)`: control periods of `hold` seconds; `path` receives the states at
+    t_eval from index `first_eval` on, `x1` the final states, `stats` the STATISTICS of every state.
     """
     writer = _Integrator(method, shape, lanes)
     writer.batch()

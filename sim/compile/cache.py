@@ -94,7 +94,7 @@ class Cache:
             try:
                 with os.fdopen(handle, "wb") as file:
                     file.write(pack(entry))
-                os.replace(name, path)
+                Path(name).replace(path)
             except OSError:
                 Path(name).unlink(missing_ok=True)
                 raise

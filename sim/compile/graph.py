@@ -9,11 +9,14 @@ nodes, or on both.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 CONST, INPUT, ADD, SUB, MUL, NEG, INV, SQRT, SIN, COS, MIN, MAX, ABS, LESS, ATAN2, HOLD, ROUND = range(17)
-OP_NAMES = "const input add sub mul neg inv sqrt sin cos min max abs less atan2 hold round".split()
+OP_NAMES = (
+    *("const", "input", "add", "sub", "mul", "neg", "inv", "sqrt", "sin", "cos"),
+    *("min", "max", "abs", "less", "atan2", "hold", "round"),
+)
 BINARY = frozenset((ADD, SUB, MUL, MIN, MAX, LESS, ATAN2))
 _COMMUTATIVE = frozenset((ADD, MUL, MIN, MAX))
 
@@ -66,6 +69,9 @@ class Node:
     def __rtruediv__(self, other: float) -> Scalar:
         return self.graph.inv(self) * other
 
+    def __float__(self) -> float:
+        raise TypeError("a symbol has no value")
+
     def __repr__(self) -> str:
         return f"<{OP_NAMES[self.op]} {self.id}>"
 
@@ -80,7 +86,7 @@ class Graph:
         self.nodes: list[Node] = []
         self._known: dict[tuple[object, ...], Node] = {}
 
-    def inputs(self, name: str, size: int) -> list[Node]:
+    def inputs(self, name: str, size: int) -> Sequence[Node]:
         """The `size` scalars of argument `name`."""
         return [self._leaf(INPUT, (name, i)) for i in range(size)]
 
@@ -159,7 +165,7 @@ class Graph:
     def neg(self, a: Node) -> Scalar:
         """-a."""
         if a.op == NEG:
-            return a.a
+            return _inner(a)
         return -float(a.value) if a.op == CONST else self._new(NEG, a)
 
     def inv(self, a: Node) -> Scalar:
@@ -167,7 +173,7 @@ class Graph:
         if a.op == NEG:
             return self.neg(self._new(INV, a.a))
         if a.op == INV:
-            return a.a
+            return _inner(a)
         return 1.0 / a.value if a.op == CONST else self._new(INV, a)
 
     def hold(self, a: Scalar) -> Scalar:
@@ -188,6 +194,11 @@ class Graph:
     def binary(self, op: int, a: Scalar, b: Scalar) -> Node:
         """Minimum, maximum, `a < b` as 1 or 0, or atan2(a, b), as a node."""
         return self._new(op, self.node(a), self.node(b))
+
+
+def _inner(a: Node) -> Node:
+    inner: Node = a.a
+    return inner
 
 
 def sqrt(x: Scalar) -> Scalar:
@@ -222,25 +233,25 @@ def _owner(*xs: Scalar) -> Graph | None:
 def minimum(a: Scalar, b: Scalar) -> Scalar:
     """The smaller of two."""
     graph = _owner(a, b)
-    return graph.binary(MIN, a, b) if graph else min(a, b)
+    return graph.binary(MIN, a, b) if graph else min(float(a), float(b))
 
 
 def maximum(a: Scalar, b: Scalar) -> Scalar:
     """The larger of two."""
     graph = _owner(a, b)
-    return graph.binary(MAX, a, b) if graph else max(a, b)
+    return graph.binary(MAX, a, b) if graph else max(float(a), float(b))
 
 
 def less(a: Scalar, b: Scalar) -> Scalar:
     """1 where a < b, else 0; its derivative is taken as zero."""
     graph = _owner(a, b)
-    return graph.binary(LESS, a, b) if graph else float(a < b)
+    return graph.binary(LESS, a, b) if graph else float(float(a) < float(b))
 
 
 def atan2(y: Scalar, x: Scalar) -> Scalar:
     """Angle of the point (x, y)."""
     graph = _owner(y, x)
-    return graph.binary(ATAN2, y, x) if graph else math.atan2(y, x)
+    return graph.binary(ATAN2, y, x) if graph else math.atan2(float(y), float(x))
 
 
 def clip(x: Scalar, low: float, high: float) -> Scalar:

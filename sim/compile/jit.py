@@ -14,7 +14,8 @@ def host() -> tuple[str, str, str]:
     """Target triple, processor name and features of this machine."""
     import llvmlite.binding as llvm
 
-    return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    features: str = llvm.get_host_cpu_features().flatten()
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
 
 @cache
@@ -38,7 +39,7 @@ def llvm_version() -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
-    return ".".join(map(str, llvm.llvm_version_info)) + "/" + llvmlite.__version__
+    return f"{'.'.join(map(str, llvm.llvm_version_info))}/{llvmlite.__version__}"
 
 
 def target_machine(level: int) -> Any:

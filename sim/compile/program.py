@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -110,7 +111,7 @@ def in_parallel(call: Callable[[int, int], None], count: int, lanes: int, thread
         call(0, count)
         return
     edges = [min(count, (blocks * k // threads) * lanes) for k in range(threads)] + [count]
-    jobs = [_pool().submit(call, a, b - a) for a, b in zip(edges[1:-1], edges[2:], strict=True)]
+    jobs = [_pool().submit(call, a, b - a) for a, b in pairwise(edges[1:])]
     call(edges[0], edges[1])
     for job in jobs:
         job.result()
@@ -161,10 +162,8 @@ class Bound:
         self.outputs = {name: np.zeros(size) for name, size in program.outputs.items()}
         arguments = [x for array in self.inputs.values() for x in (address(array), 0)]
         arguments += [address(array) for array in self.outputs.values()]
-        function, fixed = program.function, tuple(arguments)
-        self._keep = program
-        self._call = lambda: function(1, *fixed)
+        self._program, self._function, self._arguments = program, program.function, tuple(arguments)
 
     def __call__(self) -> None:
         """Compute the outputs from the inputs."""
-        self._call()
+        self._function(1, *self._arguments)

@@ -140,8 +140,8 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     """Integration in fixed steps, as IR.
 
     `void name(i64 n, i64 periods, i64 steps, i64 every, double h, x0, controls..., w, w_state, w_row, p,
-    p_state, path)`: `periods` control periods of `steps` steps; every `every` steps the state is recorded, the
-    initial one included. `w` has a row for each stage of each step.
+    p_state, path)`: `periods` control periods of `steps` steps; every `every` steps the state is recorded,
+    the initial one included. `w` has a row for each stage of each step.
     """
     e = Emitter(lanes)
     X, Y, U, W, P = (e.slot(size) for size in (shape.nx, shape.nx, shape.nu, shape.nw, shape.np))

@@ -1,0 +1,21 @@
+"""Smooth dynamics: the equations of motion of a MuJoCo model, written once and turned into machine code."""
+
+from .laws import LinearFeedback, joint_pd
+from .rollouts import STATUS, Path
+from .sensitivity import StepDerivatives
+from .smooth import Derivatives, Smooth, Stats, compile_model
+from .support import differences, unsupported
+
+__all__ = [
+    "STATUS",
+    "Derivatives",
+    "LinearFeedback",
+    "Path",
+    "Smooth",
+    "Stats",
+    "StepDerivatives",
+    "compile_model",
+    "differences",
+    "joint_pd",
+    "unsupported",
+]

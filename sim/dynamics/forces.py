@@ -1,7 +1,7 @@
 """Forces beside inertia and gravity: actuators, springs, dampers, dry friction, tendons linear in the joints.
 
-All follow MuJoCo's definitions (its documentation, chapter Computation, sections Actuation and Passive forces);
-dry friction, a constraint there, is a force here: -f v / sqrt(v^2 + w^2) with a stated width w.
+All follow MuJoCo's definitions (its documentation, chapter Computation, sections Actuation and Passive
+forces); dry friction, a constraint there, is a force here: -f v / sqrt(v^2 + w^2) with a stated width w.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -76,7 +76,7 @@ def _energy(eq: Equations, kind: str) -> Tape:
         for joint in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))):
             at = int(model.jnt_qposadr[joint])
             stretch = eq.q[at] - eq.fields.scalar("qpos_spring", at)
-            potential = potential + _spring_energy(eq.fields.polynomial("jnt_stiffness", joint), stretch)
+            potential = potential + _spring_energy(eq.fields.polynomial("jnt_stiffness", int(joint)), stretch)
         for joint in np.flatnonzero(np.isin(model.jnt_type, (BALL, FREE))):
             potential = potential + rotation_spring_energy(eq.fields, int(joint), eq.q)
         for tendon in range(model.ntendon):
@@ -128,7 +128,7 @@ def _held_residual(eq: Equations, kind: str, tau: Sequence[Scalar]) -> tuple[lis
 
 
 def _implicit(
-    eq: Equations, residual: Sequence[Scalar], seeds: list[dict[Node, Scalar]]
+    eq: Equations, residual: Sequence[Scalar], seeds: Sequence[Mapping[Node, Scalar]]
 ) -> list[list[Scalar]]:
     """Derivatives of the accelerations along `seeds`: -M^-1 times those of the residual."""
     out = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -36,7 +37,8 @@ class LinearFeedback:
     def pattern(self) -> NDArray[np.bool_]:
         """Where gains are."""
         K = np.asarray(self.K)
-        return K.astype(bool) if K.ndim == 2 else K.any(axis=0)
+        mask: NDArray[np.bool_] = (K if K.ndim == 2 else np.abs(K).max(axis=0)) != 0
+        return mask
 
     def gains(self) -> Array:
         """The gains of the pattern, shape (ng,) or (batch, ng)."""
@@ -85,7 +87,7 @@ class LinearFeedback:
         return Tape.build(sizes, {"u": out})
 
 
-def _difference(layout: Layout, to: list[Scalar], start: list[Scalar]) -> list[Scalar]:
+def _difference(layout: Layout, to: Sequence[Scalar], start: Sequence[Scalar]) -> list[Scalar]:
     """Tangent from q = `start` to `to`, as mj_differentiatePos over one second."""
     out: list[Scalar] = []
     for kind, at, _ in layout.blocks:
@@ -102,7 +104,7 @@ def _difference(layout: Layout, to: list[Scalar], start: list[Scalar]) -> list[S
 
 
 def joint_pd(model: mujoco.MjModel, kp: ArrayLike, kd: ArrayLike) -> Array:
-    """Gains K of a PD law for motors that drive one hinge or slide each: force kp (q_ref - q) + kd (v_ref - v).
+    """Gains K of a PD law, force kp (q_ref - q) + kd (v_ref - v), for motors on one hinge or slide each.
 
     `kp`, `kd` are per actuator (or one number for all) at the joint; gear and gain are divided out.
     Raises EngineError for an actuator that is not a motor on a hinge or slide.

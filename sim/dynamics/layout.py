@@ -26,7 +26,7 @@ def keyed_joints(model: mujoco.MjModel, keyed: Keyed) -> tuple[int, ...]:
             )
         counts = np.bincount(model.dof_jntid, weights=array, minlength=model.njnt)
         whole = np.bincount(model.dof_jntid, minlength=model.njnt)
-        cut = [_name(model, j) for j in np.flatnonzero((counts > 0) & (counts < whole))]
+        cut = [_name(model, j) for j in np.flatnonzero((counts > 0) & (counts < whole)).tolist()]
         if cut:
             raise EngineError(f"joints {', '.join(cut)} are keyed in part: a joint is keyed as a whole")
         return tuple(int(j) for j in np.flatnonzero(counts))

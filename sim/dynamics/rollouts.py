@@ -191,6 +191,8 @@ def control_rows(
         gains = controls.gains()
         rows = rows_of("references", references, references.shape[-1], periods, count)
         return controls, rows, per_state("K", gains, gains.shape[-1], count)
+    if callable(controls):
+        raise EngineError("a Python function as the controller works with rollout only")
     value = np.zeros(lay.nu) if controls is None else controls
     return None, rows_of("controls", value, lay.nu, periods, count), Rows(np.zeros(0), 0, 0)
 
@@ -254,7 +256,7 @@ def fixed(
     in_parallel(call, count, lanes, smooth.threads if work > _PARALLEL_OPERATIONS else 1)
     seconds = time.perf_counter() - begin
     shown = applied if law is not None else _shown(rows, count)
-    t = t0 + step * every * np.arange(path.shape[1])
+    t = np.asarray(t0 + step * every * np.arange(path.shape[1]), dtype=np.float64)
     return finish(smooth, start, t, path, shown, np.full(count, evaluations), seconds)
 
 
@@ -306,7 +308,7 @@ def adaptive(
     in_parallel(call, count, lanes, smooth.threads if count > lanes else 1)
     seconds = time.perf_counter() - begin
     shown = applied if law is not None else _shown(rows, count)
-    steps, rejected, evaluations, status = stats.astype(np.int64).T[:4]
+    _, rejected, evaluations, status = stats.astype(np.int64).T[:4]
     return finish(smooth, start, t_eval, path, shown, evaluations, seconds, rejected=rejected, status=status)
 
 
@@ -373,9 +375,9 @@ def _called_back(
     lay, x = smooth.layout, start.x
     pieces, applied, seconds = [x[:, None]], [], 0.0
     for period in range(steps // hold):
-        t = t0 + step * hold * period
+        now = t0 + step * hold * period
         q, v = x[:, : lay.nq], x[:, lay.nq : lay.nq + lay.nv]
-        u = np.asarray(law(t, q[0], v[0]) if start.single else law(t, q, v), dtype=float)
+        u = np.asarray(law(now, q[0], v[0]) if start.single else law(now, q, v), dtype=float)
         u = np.broadcast_to(u, (len(x), lay.nu))
         part = fixed(
             smooth,
@@ -385,7 +387,7 @@ def _called_back(
             hold=hold,
             every=every,
             step=step,
-            t0=t,
+            t0=now,
             w=w,
             **rest,
         )
@@ -395,5 +397,5 @@ def _called_back(
         x = np.ascontiguousarray(part.x[:, -1])
     path = np.concatenate(pieces, axis=1)
     stages = len(live_stages(rest["method"].A, rest["method"].b))
-    t = t0 + step * every * np.arange(path.shape[1])
+    t = np.asarray(t0 + step * every * np.arange(path.shape[1]), dtype=np.float64)
     return finish(smooth, start, t, path, np.stack(applied, axis=1), np.full(len(x), steps * stages), seconds)

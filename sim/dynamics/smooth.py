@@ -29,7 +29,9 @@ from .fields import Parameter, parameter_index
 from .functions import FUNCTIONS, cheaper_formulation
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
-from .rollouts import Controls, Path, Prescribed, adaptive, fixed, initial_states
+from .problem import SmoothProblem
+from .rollouts import Controls, Path, Prescribed, PythonLaw, adaptive, fixed, initial_states
+from .sensitivity import StepDerivatives, step_derivatives
 from .support import differences, unsupported
 from .symbolic import Equations
 
@@ -108,7 +110,7 @@ def compile_model(
     friction_width: float | None = None,
     lanes: int | None = None,
     threads: int | None = None,
-    cache: FilePath | None | bool = True,
+    cache: FilePath | bool | None = True,
 ) -> Smooth:
     """The smooth engine for `model`.
 
@@ -459,6 +461,31 @@ class Smooth:
             first_step=first_step,
             max_steps=max_steps,
         )
+
+    def step_derivatives(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        step: float,
+        method: Tableau = RK4,
+        act: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+    ) -> StepDerivatives:
+        """Exact derivatives of one step of `method` by state (tangent space), control and parameters.
+
+        One state (1-D arrays) or a batch. Keyed joints are not taken (EngineError).
+        """
+        if self.layout.keyed:
+            raise EngineError("step_derivatives does not take keyed joints")
+        return step_derivatives(self, initial_states(self, q, v, act), u, step=step, method=method, p=p)
+
+    def problem(
+        self, controls: ArrayLike | PythonLaw | None = None, *, w: Prescribed = None
+    ) -> SmoothProblem:
+        """dx/dt as a problem for `sim.integrate.solve`, controls constant or a function (t, q, v) -> u."""
+        return SmoothProblem(self, controls, w)
 
 
 @dataclass(frozen=True)

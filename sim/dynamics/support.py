@@ -127,7 +127,7 @@ def _actuator(model: mujoco.MjModel, actuator: int) -> list[str]:
 
 def differences(model: mujoco.MjModel, *, friction_width: float | None) -> list[str]:
     """Physics of `model` that the smooth engine models otherwise than MuJoCo, one line each."""
-    found = []
+    found: list[str] = []
     if disabled(model, "CONSTRAINT"):
         return found
     limited = int(np.count_nonzero(model.jnt_limited)) + int(np.count_nonzero(model.tendon_limited))

@@ -59,7 +59,7 @@ class Equations:
         self.gravity: list[Scalar] = [0.0] * 3
         if not disabled(model, "GRAVITY"):
             self.gravity = [float(g) for g in model.opt.gravity]
-        # a tree that floats freely falls with gravity: solved without it, which is added to its base afterwards
+        # a tree that floats freely falls with gravity: solved without it, which its base is given afterwards
         self.falling = [link.dadr for link in self.tree.links if self._falls(link)]
         falls = {index: link.dadr in self.falling for index, link in enumerate(self.tree.links)}
         self._felt = [spatial.zeros() if falls[i] else self.gravity for i in range(len(self.tree.links))]

@@ -140,7 +140,7 @@ class Link:
 
 @dataclass
 class Tree:
-    """Links in topological order, and for every body the link that carries it (-1: the world) and its pose."""
+    """Links in topological order; for every body the link that carries it (-1: the world) and its pose."""
 
     links: list[Link]
     body_link: list[int]
@@ -215,7 +215,6 @@ def _link_of_joint(model: mujoco.MjModel, joint: int, parent: int, C: Pose) -> t
     """The link behind `joint` of a body at `C` in the parent's link, and the body's pose in the new link."""
     kind = int(model.jnt_type[joint])
     qadr, dadr = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-    anchor = [float(x) for x in model.jnt_pos[joint]]
     link = Link(parent, joint, kind, qadr, dadr, Pose(np.eye(3), zeros()))
     if kind == FREE:
         return link, Pose(np.eye(3), zeros())
@@ -224,6 +223,7 @@ def _link_of_joint(model: mujoco.MjModel, joint: int, parent: int, C: Pose) -> t
         link.axis = [snap(float(x)) for x in C.R @ model.jnt_axis[joint]]
         link.X.p = [p - float(model.qpos0[qadr]) * a for p, a in zip(C.p, link.axis, strict=True)]
         return link, Pose(C.R, zeros())
+    anchor: Vector = [float(x) for x in model.jnt_pos[joint]]
     A = Pose(_z_along(model.jnt_axis[joint]) if kind == HINGE else np.eye(3), anchor)
     link.X = C @ A
     if kind == HINGE:
@@ -255,9 +255,9 @@ def _zx(R: np.ndarray) -> tuple[float, float]:
 
 
 def _choose_frames(links: list[Link]) -> None:
-    """Turn and shift every hinge's frame about its own axis so that constants of rotation and offset vanish."""
+    """Turn and shift every hinge's frame about its axis so that constant rotations and offsets vanish."""
     turned = [_common_normal(link) if link.kind == HINGE else 0.0 for link in links]
-    moves = []
+    moves: list[Pose] = []
     for index, link in enumerate(links):
         if link.kind != HINGE:  # a slide keeps its parent's orientation
             follows = link.kind == SLIDE and link.parent >= 0
@@ -315,7 +315,7 @@ def _shift(link: Link, phi: float, links: list[Link]) -> Scalar:
 
 
 def _regroup(links: list[Link]) -> None:
-    """Hand matter whose place does not depend on a joint's position to the parent: exact, and it leaves zeros.
+    """Hand matter whose place a joint does not change to the parent: exact, and it leaves zeros.
 
     What lies on a hinge's axis (all of m, h_z and J_zz), the second moment behind a slide, the mass at a
     ball's centre (base parameters: Khalil & Dombre, Modeling, Identification and Control of Robots, ch. 9).
