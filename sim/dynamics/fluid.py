@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 
 from ..compile.graph import Scalar, absolute
-from . import spatial
 from .fields import Fields
-from .kinematics import directions_in_links, velocities
-from .motion import Transform
-from .newton_euler import Wrench
-from .spatial import Vector
-from .tree import Pose, Tree
+from .rigid import spatial
+from .rigid.kinematics import directions_in_links, velocities
+from .rigid.motion import Transform
+from .rigid.newton_euler import Wrench
+from .rigid.spatial import Vector
+from .rigid.tree import Pose, Tree
 
 
 def applied_wrenches(

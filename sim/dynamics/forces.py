@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from ..compile.graph import Scalar, absolute, clip, maximum, minimum, nearest, sqrt
-from . import spatial
 from .fields import Fields
-from .tree import BALL, FREE, HINGE, SLIDE
+from .rigid import spatial
+from .rigid.tree import BALL, FREE, HINGE, SLIDE
 
 _DISABLE = mujoco.mjtDisableBit
 _DYN, _GAIN, _BIAS, _TRN = mujoco.mjtDyn, mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtTrn

@@ -10,11 +10,11 @@ import numpy as np
 from ..compile.diff import directional, gradient
 from ..compile.graph import Node, Scalar
 from ..compile.tape import Tape
-from . import spatial
 from .forces import disabled, rotation_spring_energy, tendon_stretch
-from .kinematics import body_pose, gravity_energy, kinetic_energy, link_poses, momentum
+from .rigid import spatial
+from .rigid.kinematics import body_pose, gravity_energy, kinetic_energy, link_poses, momentum
+from .rigid.tree import BALL, FREE, HINGE, SLIDE, Pose
 from .symbolic import Equations
-from .tree import BALL, FREE, HINGE, SLIDE, Pose
 
 STATE = "q v act u tau w p"
 FORMULATIONS = ("composite", "articulated")

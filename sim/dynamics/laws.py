@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..compile.graph import Graph, Scalar
 from ..compile.tape import Tape
 from ..errors import EngineError
-from . import spatial
 from .layout import Layout
-from .tree import BALL, FREE
+from .rigid import spatial
+from .rigid.tree import BALL, FREE
 
 Array = NDArray[np.float64]
 

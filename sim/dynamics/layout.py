@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from ..errors import EngineError, unknown
-from .tree import BALL, COORDINATES, DOFS, FREE
+from .rigid.tree import BALL, COORDINATES, DOFS, FREE
 
 Keyed = Sequence[str | int] | np.ndarray
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..integrate.tableau import Tableau
 from .layout import Layout
-from .tree import BALL, FREE
+from .rigid.tree import BALL, FREE
 
 if TYPE_CHECKING:
     from .rollouts import Start

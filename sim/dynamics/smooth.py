@@ -71,7 +71,7 @@ def model_fingerprint(model: mujoco.MjModel) -> bytes:
 def _code_fingerprint() -> str:
     """Hash of this engine's own source: another version never reads what this one compiled."""
     here = FilePath(__file__).parent
-    files = sorted([*here.glob("*.py"), *(here.parent / "compile").glob("*.py")])
+    files = sorted([*here.rglob("*.py"), *(here.parent / "compile").glob("*.py")])
     return key_of(*(file.read_bytes() for file in files))
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from .forces import active, disabled
-from .tree import BALL, FREE
+from .rigid.tree import BALL, FREE
 
 _OBJ = mujoco.mjtObj
 _DYN, _GAIN, _BIAS, _TRN, _WRAP = (

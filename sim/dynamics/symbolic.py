@@ -10,17 +10,17 @@ import mujoco
 from ..compile.graph import Graph, Node, Scalar
 from ..compile.tape import Tape
 from ..errors import EngineError
-from . import spatial
-from .articulated import articulated_solve
 from .fields import Fields, Parameter, parameter_index
 from .fluid import applied_wrenches
 from .forces import actuator_forces, disabled, passive_forces
 from .layout import Layout
-from .mass_matrix import Entries, Factor, dense, dof_parents, mass_matrix
-from .motion import transforms
-from .newton_euler import generalized_forces
+from .rigid import spatial
+from .rigid.articulated import articulated_solve
+from .rigid.mass_matrix import Entries, Factor, dense, dof_parents, mass_matrix
+from .rigid.motion import transforms
+from .rigid.newton_euler import generalized_forces
+from .rigid.tree import BALL, FREE, Link, build_tree
 from .support import unsupported
-from .tree import BALL, FREE, Link, build_tree
 
 
 class Equations:

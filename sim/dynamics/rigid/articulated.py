@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from ..compile.graph import Node, Scalar
-from .fields import Fields
+from ...compile.graph import Node, Scalar
+from ..fields import Fields
 from .motion import Transform
 from .spatial import Matrix, Vector, add, cross, dot
 from .tree import FREE, HINGE, SLIDE, Inertia, Link, Tree

@@ -13,8 +13,8 @@ from math import atan2, cos, hypot, pi, sin
 import mujoco
 import numpy as np
 
-from ..compile.graph import Node, Scalar
-from .fields import Fields
+from ...compile.graph import Node, Scalar
+from ..fields import Fields
 from .spatial import Matrix, Vector, zeros
 
 FREE, BALL, SLIDE, HINGE = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ..compile.graph import Scalar
+from ...compile.graph import Scalar
 from . import spatial
 from .motion import Transform
 from .spatial import Matrix, Vector

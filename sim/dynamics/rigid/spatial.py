@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..compile.graph import Scalar, absolute, atan2, less, sqrt
+from ...compile.graph import Scalar, absolute, atan2, less, sqrt
 
 Vector = list[Scalar]
 Matrix = list[list[Scalar]]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi
 
-from ..compile.graph import Scalar, cos, sin
+from ...compile.graph import Scalar, cos, sin
 from . import spatial
 from .spatial import Matrix, Turn, Vector
 from .tree import BALL, FREE, HINGE, SLIDE, Link, Tree, quaternion_of_rotation, snap

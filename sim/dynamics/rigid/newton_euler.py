@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..compile.graph import Scalar
+from ...compile.graph import Scalar
 from .motion import Transform
 from .spatial import Matrix, Vector, add, cross, dot, scale, sub, zeros
 from .tree import BALL, FREE, HINGE, SLIDE, Link, Tree

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from ..compile.graph import Scalar
-from .fields import Fields
+from ...compile.graph import Scalar
+from ..fields import Fields
 from .motion import Transform
 from .newton_euler import joint_components
 from .spatial import Vector, add, cross, scale, zeros

@@ -1,0 +1,1 @@
+"""Rigid bodies in a tree: frames, recursions and solves over generic scalars."""
