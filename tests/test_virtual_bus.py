@@ -1,8 +1,10 @@
 """The official SDK on virtual servos, in memory and on a pseudo-terminal; wire time; faults."""
 
 import os
+import select
 import subprocess
 import sys
+import termios
 import textwrap
 import time
 from collections.abc import Callable, Iterator
@@ -670,15 +672,16 @@ def test_a_link_into_nowhere_is_refused(tmp_path):
         PtyServer(VirtualBus([]), link=tmp_path / "nowhere" / "tty")
 
 
-def test_terminal_needs_no_echo_and_keeps_control_bytes():
-    """A raw terminal: bytes that a cooked one would interpret come through, and nothing is echoed."""
-    with serve(VirtualBus(servos(1))) as server:
+def test_terminal_is_raw_for_programs_that_do_not_make_it_so():
+    """A program that sets the rate alone gets its reply byte for byte, without waiting for a line to end."""
+    with serve(VirtualBus([VirtualServo("xm430-w210", 13, firmware=10)])) as server:
         fd = os.open(server.port, os.O_RDWR | os.O_NOCTTY)
         try:
-            os.write(fd, bytes(range(32)))
-            time.sleep(0.05)
-            os.set_blocking(fd, False)
-            with pytest.raises(BlockingIOError):
-                os.read(fd, 100)
+            state = termios.tcgetattr(fd)
+            state[4] = state[5] = termios.B57600
+            termios.tcsetattr(fd, termios.TCSANOW, state)
+            os.write(fd, p.ping(13).encode())
+            assert select.select([fd], [], [], 5)[0]
+            assert Packet.decode(os.read(fd, 100)) == p.status(13, 0, b"\x06\x04\x0a")
         finally:
             os.close(fd)
