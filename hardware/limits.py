@@ -164,15 +164,15 @@ def fit(motion: Motion, verdict: Verdict, *, slow: bool) -> Motion:
 def _position(names: tuple[str, ...], t: Array, q: Array, low: Array, high: Array, who: str) -> list[Check]:
     out = []
     for i, name in enumerate(names):
-        middle, half = (low[i] + high[i]) / 2, (high[i] - low[i]) / 2
         beyond = np.maximum(q[:, i] - high[i], low[i] - q[:, i])
-        beyond = np.where(np.isnan(q[:, i]), np.inf, beyond)
+        beyond = np.where(np.isnan(q[:, i]), np.inf, beyond)  # where a transmission does not reach
         k = int(np.argmax(beyond))
+        half = (high[i] - low[i]) / 2
         slack = _ROUNDING if who == "servo" else 1e-3 * half if np.isfinite(half) else 0.0
-        share = abs(q[k, i] - middle) / half if np.isfinite(half) else 0.0
-        limit = high[i] if q[k, i] > middle or not np.isfinite(middle) else low[i]
+        share = 1 + float(beyond[k]) / half if np.isfinite(half) else 0.0
+        limit = high[i] if q[k, i] - high[i] >= low[i] - q[k, i] else low[i]
         slower = np.inf if beyond[k] > slack else 1.0
-        out.append(Check("position", f"{who} {name}", q[k, i], limit, "", float(share), float(t[k]), slower))
+        out.append(Check("position", f"{who} {name}", q[k, i], limit, "", share, float(t[k]), slower))
     return out
 
 

@@ -72,6 +72,9 @@ class Table:
         self._curve = PchipInterpolator(x, u)
         self._slope, self._bend = self._curve.derivative(1), self._curve.derivative(2)
         self._x, self._u = x, u
+        chords = np.diff(u)[[0, -1]] / np.diff(x)[[0, -1]]
+        ends = self._slope(x[[0, -1]])
+        self._ends = np.where(np.abs(ends) > 1e-3 * np.abs(chords), ends, chords)
 
     def angle(self, q: Array) -> tuple[Array, Array, Array]:
         """See Transmission."""
@@ -84,10 +87,9 @@ class Table:
         )
 
     def _end_slope(self, q: Array) -> Array:
-        """Slope of the chord at the nearer end: that of the cubic may be zero there."""
-        x, u = self._x, self._u
-        first, last = (u[1] - u[0]) / (x[1] - x[0]), (u[-1] - u[-2]) / (x[-1] - x[-2])
-        return np.asarray(np.where(q < x[0], first, last), dtype=float)
+        """Slope at the nearer end; that of the chord where the cubic is flat there."""
+        first, last = self._ends
+        return np.asarray(np.where(q < self._x[0], first, last), dtype=float)
 
     def joint(self, u: Array) -> Array:
         """See Transmission: bisection, which a monotone curve needs and a flat spot survives."""
