@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.hardware import packets as p
-from pantograph.hardware.errors import HardwareError
+from pantograph.hardware.errors import HardwareError, RegisterError
 from pantograph.hardware.packets import ALERT, StatusError
 from pantograph.hardware.registers import model_names
 from pantograph.hardware.tables.rows import ACCELERATION, VELOCITY
@@ -586,6 +586,7 @@ def test_watchdog_stops_in_time(mode):
     assert write(servo, goal, 100) == StatusError.DATA_RANGE
     run(servo, 0.3)
     assert abs(read(servo, "present_position") - stopped) <= 1
+    assert write(servo, "bus_watchdog", 5) == StatusError.DATA_RANGE
     assert write(servo, "bus_watchdog", 0) == OK
     run(servo, 0.3)
     assert abs(read(servo, "present_position") - stopped) <= 1
@@ -714,7 +715,20 @@ def test_mode_change_resets_profiles_and_gains():
     ]
 
 
+def test_given_registers_hold():
+    servo = VirtualServo("xm430-w350", registers={"drive_mode": 4, "torque_enable": 1, "goal_position": 3000})
+    run(servo, 2.0)
+    assert read(servo, "drive_mode") == 4
+    assert read(servo, "present_position") == pytest.approx(3000, abs=20)
+    servo.execute(p.reboot(1))
+    assert (servo.get("drive_mode"), servo.get("torque_enable")) == (4, 0)
+
+
 def test_wrong_descriptions_are_refused():
+    with pytest.raises(RegisterError, match="999 does not fit register 'return_delay_time'"):
+        VirtualServo("xm430-w350", registers={"return_delay_time": 999})
+    with pytest.raises(RegisterError, match="no register 'goal'"):
+        VirtualServo("xm430-w350", registers={"goal": 1})
     with pytest.raises(HardwareError, match=r"no bit rate 123.*1,000,000"):
         VirtualServo("xm430-w350", baud=123)
     with pytest.raises(HardwareError, match="no servo model"):

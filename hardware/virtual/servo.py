@@ -52,8 +52,8 @@ class Quirks:
 class VirtualServo:
     """One servo on a virtual bus.
 
-    Kept but without effect: feedforward gains, PWM slope, acceleration limit, external ports, LED, protocol
-        type other than 2.0, and restoring RAM at startup.
+    Kept but without effect: feedforward gains, PWM slope, acceleration limit, external ports, LED, a
+    protocol type other than 2.0, and restoring RAM at startup.
 
     Args:
         model: Name or number of a model that has a control table.
@@ -66,7 +66,11 @@ class VirtualServo:
         supply: Voltage [V]; the recommended one when None.
         ambient: Temperature [degC].
         quirks: What the manual leaves open.
-        registers: Factory values to replace, in counts, by name (EEPROM or RAM).
+        registers: Values in counts, by name, in place of the factory's; those of RAM last until a reboot.
+
+    Raises:
+        RegisterError: no such model or register, or a value that does not fit it.
+        HardwareError: the model does not have the bit rate.
     """
 
     def __init__(
@@ -88,7 +92,7 @@ class VirtualServo:
         self.quirks = quirks
         motor = motor or MOTORS[self.table.model]
         plant = plant or Gear(motor.inertia, motor.coulomb, position=position)
-        self.drive = Drive(motor, plant, supply=supply or motor.voltage, ambient=ambient)
+        self.drive = Drive(motor, plant, supply=motor.voltage if supply is None else supply, ambient=ambient)
         self.memory = Memory(self.table)
         self.time = 0.0
         self.dead = False
@@ -104,9 +108,15 @@ class VirtualServo:
         self._factory()
         self.memory.put("id", id)
         self.memory.put("baud_rate", self._baud_value(baud))
-        for name, raw in (registers or {}).items():
-            self.memory.put(self.table[name].name, raw)
+        given = {self.table[name]: raw for name, raw in (registers or {}).items()}
+        for row, raw in given.items():
+            row.encode(raw)
+            if row.area == "EEPROM":
+                self.memory.put(row.name, raw)
         self._power_on()
+        for row, raw in given.items():
+            if row.area == "RAM":
+                self._set(row, raw)
 
     # State that a bus and a test look at.
 
@@ -347,6 +357,8 @@ class VirtualServo:
             return StatusError.ACCESS
         if row.name in GOALS and self.memory.get("bus_watchdog") == -1:
             return StatusError.DATA_RANGE
+        if row.name == "bus_watchdog" and raw and self.memory.get(row.name) == -1:
+            return StatusError.DATA_RANGE  # only 0 clears it
         if row.name == "operating_mode" and raw not in self.table.modes:
             return StatusError.DATA_RANGE
         if row.name == "goal_position":
