@@ -145,7 +145,7 @@ def test_grounds_are_drawn_where_rays_meet_them(kind):
     inside = np.isfinite(expected)
     sure = ~near_edge(inside)
     assert (np.isfinite(depth) == inside)[sure].mean() == 1.0
-    error = np.abs(depth - expected)[inside & sure]
+    error = np.abs(depth[inside & sure] - expected[inside & sure])
     if kind == "plane":
         assert error.max() < 1e-4
     else:  # MuJoCo may cut a cell along its other diagonal
@@ -438,6 +438,31 @@ def test_shadows_fall_on_the_side_away_from_the_light(kind, side):
         tilt = np.linalg.norm(side) / 2
         expected = np.pi * 0.2**2 * np.hypot(1, tilt) * metre**2
         assert len(shaded) == pytest.approx(expected, rel=0.25)
+
+
+@needs_gl
+@settings(max_examples=6, deadline=None)
+@given(seed=st.integers(0, 10_000), kind=st.sampled_from(["directional", "point"]))
+def test_every_geom_casts_its_shadow(seed, kind):
+    rng = np.random.default_rng(seed)
+    places = np.column_stack([rng.uniform(-1.2, 1.2, (4, 2)), rng.uniform(0.4, 0.8, 4)])
+    balls = "".join(f'<geom size=".12" pos="{x} {y} {z}"/>' for x, y, z in places)
+    model = scene(f'<geom type="plane" size="4 4 .1"/>{balls}')
+    source = np.array([*rng.uniform(-2, 2, 2), 4.0])
+    light = Light("l", kind, source, (0, 0, 0))
+    camera = Camera(position=(0.01, 0, 9), fovy=0.5)
+    pictures = []
+    for shadows in (True, False):
+        with Renderer(model, width=W, height=H, lights=[light], shadows=shadows) as renderer:
+            pictures.append(renderer.render(model.qpos0, camera=camera).astype(int).sum(axis=2))
+    rays = np.tile(-source, (4, 1)) if kind == "directional" else places - source
+    feet = places - rays * (places[:, 2:] / rays[:, 2:])
+    pose = camera.pose(0, mujoco.MjData(model))
+    at = np.round(project(*pose, feet)).astype(int)
+    hidden = np.linalg.norm(at[:, None] - project(*pose, places)[None], axis=2).min(axis=1) < 6
+    for (column, row), under in zip(at, hidden, strict=True):
+        if not under and 0 <= row < H and 0 <= column < W:
+            assert pictures[0][row, column] < 0.8 * pictures[1][row, column]
 
 
 @needs_gl

@@ -230,7 +230,10 @@ class Renderer:
         GL.glPolygonOffset(1.5, 4.0)
         middle = self.model.geom_aabb[self._casters, :3]
         centers = X_WG[self._casters, :3, 3] + np.einsum("gij,gj->gi", X_WG[self._casters, :3, :3], middle)
-        radii = np.linalg.norm(self.model.geom_aabb[self._casters, 3:], axis=1)
+        radii = np.minimum(
+            np.linalg.norm(self.model.geom_aabb[self._casters, 3:], axis=1),
+            self.model.geom_rbound[self._casters] + np.linalg.norm(middle, axis=1),
+        )
         for light, (_, index) in zip(lights, self._layout, strict=True):
             if index >= 0:
                 shadow_map = self._maps[index]
