@@ -2,7 +2,16 @@
 
 from ..models.errors import ModelError, PantographError, unknown
 
-__all__ = ["EngineError", "FilmError", "KeyingError", "ModelError", "PantographError", "RecordingError", "SceneError", "unknown"]
+__all__ = [
+    "EngineError",
+    "FilmError",
+    "KeyingError",
+    "ModelError",
+    "PantographError",
+    "RecordingError",
+    "SceneError",
+    "unknown",
+]
 
 
 class SceneError(PantographError):
@@ -10,7 +19,7 @@ class SceneError(PantographError):
 
 
 class KeyingError(PantographError):
-    """Keys contradict themselves or what they key: order of times, shapes, kinds, ends of a loop, channels."""
+    """Keys contradict themselves or what they key: times, shapes, kinds, ends of a loop, channels."""
 
 
 class EngineError(PantographError):
