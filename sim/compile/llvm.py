@@ -215,8 +215,11 @@ class Emitter:
             r = self.f("fsub", r, self.f("fmul", turns, self.const(part)))
         z = self.f("fmul", r, r)
         sine = self.f("fadd", self.f("fmul", self.f("fmul", r, z), self.polynomial(_SIN, z)), r)
-        head = self.f("fsub", self.const(1.0), self.f("fmul", z, self.const(0.5)))
-        cosine = self.f("fadd", self.f("fmul", self.f("fmul", z, z), self.polynomial(_COS, z)), head)
+        half = self.f("fmul", z, self.const(0.5))
+        head = self.f("fsub", self.const(1.0), half)
+        lost = self.f("fsub", self.f("fsub", self.const(1.0), head), half)  # rounding of the head
+        tail = self.f("fadd", self.f("fmul", self.f("fmul", z, z), self.polynomial(_COS, z)), lost)
+        cosine = self.f("fadd", head, tail)
         odd = self.i("and", quarter, self.iconst(1))
         swap = self.emit(f"icmp ne {self.I} {odd}, {self.iconst(0)}")
         sign_s = self.i("shl", self.i("and", quarter, self.iconst(2)), self.iconst(62))
