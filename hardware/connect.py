@@ -21,10 +21,11 @@ TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind 
 
 
 def rest_pose(rig: Rig) -> Array:
-    """Joint values (nj,) in the middle of what soft limits and servos allow, zero where that allows zero."""
+    """Joint values (nj,) as near to zero as soft limits and servos allow."""
     mapping, servos, joints = make_mapping(rig), make_bounds(rig), joint_bounds(rig)
-    q = np.where((joints.low <= 0) & (joints.high >= 0), 0.0, 0.5 * (joints.low + joints.high))
-    s = np.clip(mapping.servo(np.where(np.isfinite(q), q, 0.0)), servos.low, servos.high)
+    zero = (joints.low <= 0) & (joints.high >= 0)
+    q = np.where(zero, 0.0, np.clip(0.0, joints.low, joints.high))
+    s = np.clip(mapping.servo(q), servos.low, servos.high)
     return mapping.joint(s)
 
 

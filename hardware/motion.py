@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ from ..sim.recording import Recording
 from .mapping import Mapping, indices
 
 Array = NDArray[np.float64]
+_BEND = 0.2  # relative difference of velocities at which a sample is a bend
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,29 @@ class Motion:
         i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         h = (self.t[i + 1] - self.t[i])[..., None]
         x = (t - self.t[i])[..., None] / h
-        q0, q1, v0, v1 = self.q[i], self.q[i + 1], h * self.v[i], h * self.v[i + 1]
+        q0, q1, v0, v1 = self.q[i], self.q[i + 1], h * self.v[i], h * self._arrival[i]
         # Hermite: q = q0 + x (v0 + x (c2 + x c3))
         c2, c3 = 3 * (q1 - q0) - 2 * v0 - v1, 2 * (q0 - q1) + v0 + v1
         return q0 + x * (v0 + x * (c2 + x * c3)), (v0 + x * (2 * c2 + 3 * x * c3)) / h
 
+    @cached_property
+    def _arrival(self) -> Array:
+        """Velocity (n - 1, nj) at the end of each interval: that of the next sample, unless the motion
+        bends there.
+
+        Velocities are limits from the right. Where the next one is far from what the interval itself says
+        (the parabola through its ends and first velocity), the keys bend, and a cubic would overshoot.
+        """
+        v0, v1 = self.v[:-1], self.v[1:]
+        parabola = 2 * np.diff(self.q, axis=0) / np.diff(self.t)[:, None] - v0
+        bends = np.abs(v1 - parabola) > _BEND * 0.5 * (np.abs(v0) + np.abs(v1)) + 1e-9
+        return np.where(bends, parabola, v1)
+
     def dense(self, parts: int = 8) -> Array:
         """Times of every sample, with `parts` equal steps between two."""
-        steps = np.linspace(0.0, 1.0, parts, endpoint=False)
+        steps = np.append(
+            np.linspace(0.0, 1.0, parts, endpoint=False), 1 - 1e-9
+        )  # and the limit from the left
         return np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * steps).ravel(), self.t[-1])
 
 

@@ -302,8 +302,18 @@ def test_a_jump_between_samples_is_seen_though_its_recorded_speed_is_zero() -> N
     q = np.where(t < 0.5, 0.0, 1.0)[:, None]
     motion = Motion(t, q, np.zeros_like(q), np.zeros_like(q))
     verdict = check_motion(motion, ONE, bounds(velocity=5.0), FREE, no_load(motion))
-    # A cubic step of 1 rad in 10 ms peaks at 1.5 / 0.01 rad/s, twice that at the servo.
-    assert np.isclose(verdict.slowdown, 2 * 1.5 / 0.01 / 5.0, rtol=1e-6)
+    # 1 rad in 10 ms from rest, as a parabola, ends with 2 / 0.01 rad/s, twice that at the servo.
+    assert np.isclose(verdict.slowdown, 2 * 2.0 / 0.01 / 5.0, rtol=1e-6)
+
+
+def test_motion_does_not_overshoot_where_keys_bend() -> None:
+    t = np.linspace(0, 1, 11)
+    q = np.minimum(t, 0.5)[:, None]
+    motion = Motion(t, q, np.where(t < 0.5 - 1e-9, 1.0, 0.0)[:, None], np.zeros_like(q))
+    dense = motion.dense()
+    got, speed = motion.at(dense)
+    assert np.allclose(got[:, 0], np.minimum(dense, 0.5), atol=1e-12)
+    assert speed.max() < 1 + 1e-9
 
 
 def test_refusal_names_the_way_out_and_slow_takes_it() -> None:
