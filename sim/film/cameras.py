@@ -119,17 +119,18 @@ class Camera:
         When the motion travels further than a few times the model's own size, a camera that travels along.
         `aspect` is the picture's width over its height.
         """
-        low, high = motion_boxes(model, np.atleast_2d(np.asarray(q_frames, dtype=float)))
+        corners = motion_corners(model, np.atleast_2d(np.asarray(q_frames, dtype=float)))
+        low, high = corners.min(axis=1), corners.max(axis=1)
         middle, size = (low + high) / 2, float(np.median(np.linalg.norm(high - low, axis=1)))
         travel = float(np.linalg.norm(np.ptp(middle, axis=0)))
         direction = np.array([0.62, -1.0, 0.42])
         direction /= np.linalg.norm(direction)
         body = _moving_root(model)
         if travel > 3 * size and body:
-            distance = max(_distance(low - middle, high - middle, direction, aspect), 1e-3)
+            distance = _distance(corners - middle[:, None], direction, aspect)
             return cls("auto", "tracking", position=1.2 * distance * direction, frame=body)
         centre = (low.min(axis=0) + high.max(axis=0)) / 2
-        distance = _distance(low - centre, high - centre, direction, aspect)
+        distance = _distance(corners - centre, direction, aspect)
         return cls("auto", "fixed", position=centre + distance * direction, target=centre)
 
     def _angle(self, t: float, default: float) -> float:
@@ -183,8 +184,8 @@ def look_at(position: ArrayLike, target: ArrayLike, *, roll: float = 0.0) -> Flo
     return X_WC
 
 
-def motion_boxes(model: mujoco.MjModel, q: Floats, *, most: int = 64) -> tuple[Floats, Floats]:
-    """Lower and upper corners (k, 3) of the drawn geoms' boxes at up to `most` poses of q (n, nq).
+def motion_corners(model: mujoco.MjModel, q: Floats, *, most: int = 64) -> Floats:
+    """Corners (k, n, 3) of the boxes round all drawn geoms, at up to `most` poses of q (m, nq).
 
     Planes and height fields are left out unless nothing else is there.
     """
@@ -192,30 +193,28 @@ def motion_boxes(model: mujoco.MjModel, q: Floats, *, most: int = 64) -> tuple[F
 
     geoms = np.array([g for g in drawn_geoms(model) if model.geom_rbound[g] > 0], dtype=int)
     grounds = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    solid = geoms[~np.isin(model.geom_type[geoms], grounds)] if len(geoms) else geoms
+    solid = geoms[~np.isin(model.geom_type[geoms], grounds)]
     geoms = solid if len(solid) else geoms
-    rows = np.unique(np.linspace(0, len(q) - 1, most).astype(int))
-    low, high = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    signs = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
+    local = model.geom_aabb[geoms, None, :3] + signs * model.geom_aabb[geoms, None, 3:]
     data = mujoco.MjData(model)
-    middle, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
-    for k, row in enumerate(rows):
+    found = []
+    for row in np.unique(np.linspace(0, len(q) - 1, most).astype(int)):
         data.qpos[:] = q[row]
         mujoco.mj_kinematics(model, data)
-        if not len(geoms):
-            low[k], high[k] = data.xpos.min(axis=0) - 0.1, data.xpos.max(axis=0) + 0.1
-            continue
-        R = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        centre = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", R, middle)
-        reach = np.einsum("gij,gj->gi", np.abs(R), half)
-        low[k], high[k] = (centre - reach).min(axis=0), (centre + reach).max(axis=0)
-    return low, high
+        if len(geoms):
+            R_WG = data.geom_xmat[geoms].reshape(-1, 3, 3)
+            corners = data.geom_xpos[geoms, None] + np.einsum("gij,gcj->gci", R_WG, local)
+        else:
+            corners = data.xpos[:, None] + 0.1 * signs
+        found.append(corners.reshape(-1, 3))
+    return np.array(found)
 
 
-def _distance(low: Floats, high: Floats, direction: Floats, aspect: float) -> float:
-    """How far along `direction` from the origin a camera stands that sees the boxes (k, 3) with a margin."""
-    corners = np.concatenate([np.where(pick, high, low) for pick in np.ndindex(2, 2, 2)])
-    in_camera = corners @ look_at(direction, np.zeros(3))[:3, :3]
-    slope = 0.9 * np.tan(_FOVY / 2)
+def _distance(points: Floats, direction: Floats, aspect: float) -> float:
+    """How far along `direction` from the origin a camera sees all points (..., 3), with a margin."""
+    in_camera = points.reshape(-1, 3) @ look_at(direction, np.zeros(3))[:3, :3]
+    slope = 0.86 * np.tan(_FOVY / 2)
     needed = np.maximum(np.abs(in_camera[:, 0]) / (slope * aspect), np.abs(in_camera[:, 1]) / slope)
     return max(float(np.max(needed + in_camera[:, 2])), 1e-3)
 

@@ -137,7 +137,7 @@ def _material(model: mujoco.MjModel, geom: int) -> Material:
 
 
 def _square(model: mujoco.MjModel) -> float:
-    """Side in metres of a bare floor's squares: about a third of the model; 1, 2 or 5 times a power of ten."""
+    """Side in metres of a bare floor's squares: 1, 2 or 5 times a power of ten, near a third of the model."""
     third = max(float(model.stat.extent), 1e-6) / 3
     power = 10.0 ** np.floor(np.log10(third))
     return float(power * max(step for step in (1, 2, 5) if step * power <= third * (1 + 1e-9)))

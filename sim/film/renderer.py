@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FilmError
 from . import shaders
-from .cameras import Camera, motion_boxes
+from .cameras import Camera, motion_corners
 from .context import Context
 from .drawing import Batch, batches
 from .gl import Picture, Program, ShadowMap, upload_texture
@@ -61,9 +61,10 @@ class Renderer:
         self.model, self.width, self.height = model, int(width), int(height)
         self._data = mujoco.MjData(model)
         self._tints = np.broadcast_to(tints, (3, 3))
-        low, high = motion_boxes(model, model.qpos0[None])
+        corners = motion_corners(model, model.qpos0[None])[0]
+        low, high = corners.min(axis=0), corners.max(axis=0)
         self._extent = max(float(np.linalg.norm(high - low)), float(model.stat.extent), 1e-3)
-        self._middle = (low + high)[0] / 2
+        self._middle = (low + high) / 2
         self._haze = (6 * self._extent, 25 * self._extent)
         self._batches, self.not_drawn = batches(model, plane_radius=1.5 * self._haze[1])
         self._solid = np.concatenate([[]] + [b.geoms for b in self._batches if not b.ground]).astype(int)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 
 SEGMENTS = 96  # round the axis of a curved shape: surfaces true to 0.1 % of the radius
-_CREASE = np.deg2rad(35.0)  # faces that meet at a sharper angle are shaded apart
+_CREASE = np.deg2rad(25.0)  # faces that meet at a sharper angle are shaded apart
 
 
 @dataclass(frozen=True)

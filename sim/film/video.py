@@ -60,8 +60,8 @@ def write(
         writer = _write_still
     else:
         raise FilmError(
-            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, frames as 'name_%04d.png' or "
-            f"a folder; stills: {', '.join(_STILLS)}"
+            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, frames as 'name_%04d.png' "
+            f"or a folder; stills: {', '.join(_STILLS)}"
         )
     shown = _with_progress(frames, total, target.name) if progress else iter(frames)
     try:
