@@ -1,1 +1,37 @@
 """Inverse kinematics with a verdict."""
+
+from .goals import (
+    CenterOfMass,
+    Distance,
+    Goal,
+    JointValue,
+    LookAt,
+    Mirror,
+    Orientation,
+    PointOnLine,
+    PointOnPlane,
+    Pose,
+    Position,
+    Posture,
+)
+from .solve import solve
+from .verdict import Residual, Solution, Verdict
+
+__all__ = [
+    "CenterOfMass",
+    "Distance",
+    "Goal",
+    "JointValue",
+    "LookAt",
+    "Mirror",
+    "Orientation",
+    "PointOnLine",
+    "PointOnPlane",
+    "Pose",
+    "Position",
+    "Posture",
+    "Residual",
+    "Solution",
+    "Verdict",
+    "solve",
+]

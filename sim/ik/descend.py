@@ -1,0 +1,160 @@
+"""Damped least squares over a batch of configurations inside their limits, and Newton's method at its end."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .goals import Rows
+from .problem import Problem
+
+Array = NDArray[np.float64]
+_LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
+_STALL = 12  # iterations without progress that end an attempt
+
+
+class Descent(NamedTuple):
+    """Where a batch ended: q (n, nq), residuals r (n, m) without weights, cost (n,), iterations, met (n,)."""
+
+    q: Array
+    r: Array
+    cost: Array
+    iterations: int
+    met: NDArray[np.bool_]
+
+
+def descend(problem: Problem, q: Array, *, iterations: int = 100, first: bool = False) -> Descent:
+    """Levenberg-Marquardt from every row of `q` (n, nq), freedoms at their limits held while pushed outward.
+
+    The damping follows the cost (Fan & Yuan 2005: local convergence stays fast where the Jacobian loses
+    rank). Stops when all rows have met their goals or stalled; with `first`, as soon as one has met them.
+    """
+    space, n = problem.space, len(q)
+    q = space.clip(q)
+    raw = problem.raw(q)
+    w = problem.weighted(raw)
+    cost = _square(w.r)
+    r = raw.r
+    damping, stall = np.full(n, 1e-2), np.zeros(n, dtype=int)
+    live = ~_settled(problem, r, cost)
+    done = 0
+    while done < iterations and live.any() and not (first and problem.met(r).any()):
+        k = np.flatnonzero(live)
+        d = _steps(problem, q[k], Rows(w.r[k], w.J[k]), damping[k] * np.minimum(cost[k], 1.0) + 1e-15)
+        trial = space.step(q[k], d)
+        raw_k = problem.raw(trial)
+        w_k = problem.weighted(raw_k)
+        cost_k = _square(w_k.r)
+        better = cost_k < cost[k]
+        progress = cost_k < cost[k] * (1 - 1e-3)
+        b = k[better]
+        q[b], r[b], cost[b], w.r[b], w.J[b] = (
+            trial[better], raw_k.r[better], cost_k[better], w_k.r[better], w_k.J[better],
+        )  # fmt: skip
+        damping[k] = np.clip(damping[k] * np.where(better, 0.2, 6.0), 1e-12, 1e12)
+        stall[k] = np.where(progress, 0, stall[k] + 1)
+        live[k] = (stall[k] < _STALL) & ~_settled(problem, r[k], cost[k])
+        done += 1
+    return Descent(q, r, cost, done, problem.met(r))
+
+
+def _settled(problem: Problem, r: Array, cost: Array) -> NDArray[np.bool_]:
+    """Judged rows met far below their tolerance and nothing wished left to gain: no step is worth taking."""
+    tight = (np.abs(r) <= 1e-3 * problem.tolerance) | ~problem.judged
+    return np.asarray((tight.all(axis=1) & (cost < 1e-18)) | (cost < 1e-26))
+
+
+def _square(r: Array) -> Array:
+    return np.asarray(np.sum(r * r, axis=1))
+
+
+def held_projection(problem: Problem, q: Array, g: Array, J: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """J (n, m, nv) without what limits hold, and the mask (n, nv) of freedoms that are not held."""
+    mask, blocked = problem.space.free_directions(q, g)
+    mask = mask & problem.moved
+    J = J * mask[:, None, :]
+    for ball, axis in blocked:
+        part = J[:, :, ball.v : ball.v + 3]
+        J[:, :, ball.v : ball.v + 3] = part - (part @ axis[:, :, None]) * axis[:, None, :]
+    return J, mask
+
+
+def _steps(problem: Problem, q: Array, w: Rows, damping: Array) -> Array:
+    """Damped Gauss-Newton steps (n, nv), through the smaller of J^T J and J J^T."""
+    g = (w.r[:, None, :] @ w.J)[:, 0]
+    J, _ = held_projection(problem, q, g, w.J)
+    columns = np.flatnonzero(problem.moved)
+    J = J[:, :, columns]
+    n, m, nv = J.shape
+    d = np.zeros((n, problem.space.nv))
+    JT = J.transpose(0, 2, 1)
+    if m <= nv:
+        A = J @ JT + damping[:, None, None] * np.eye(m)
+        d[:, columns] = -(JT @ np.linalg.solve(A, w.r[:, :, None]))[:, :, 0]
+    else:
+        A = JT @ J + damping[:, None, None] * np.eye(nv)
+        d[:, columns] = -np.linalg.solve(A, JT @ w.r[:, :, None])[:, :, 0]
+    longest = np.abs(d).max(axis=1, initial=0.0)
+    return np.asarray(d * np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None])
+
+
+def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
+    """Newton's method for the nearest pose of one configuration q (nq,) that cannot meet its goals.
+
+    Gauss-Newton crawls where a residual stays (a stretched arm); the curvature of the kinematics, from
+    central differences of the gradient, gives the quadratic end. Levenberg's shift keeps it a descent.
+    """
+    space = problem.space
+    columns = np.flatnonzero(problem.moved)
+    x = space.clip(q[None])
+    w = problem.weighted(problem.raw(x))
+    cost, shift, done = float(_square(w.r)[0]), 1e-6, 0
+    for done in range(1, iterations + 1):  # noqa: B007
+        g = w.r[0] @ w.J[0]
+        _, mask = held_projection(problem, x, g[None], w.J)
+        free = columns[mask[0][columns]]
+        if not len(free) or np.abs(g[free]).max() < 1e-14:
+            break
+        H = _hessian(problem, x[0], free)
+        least = float(np.linalg.eigvalsh(H)[0])
+        improved = False
+        for _ in range(12):
+            A = H + (max(0.0, -least) * 1.1 + shift) * np.eye(len(free))
+            d = np.zeros(space.nv)
+            d[free] = -np.linalg.solve(A, g[free])
+            d *= min(1.0, 0.5 / max(np.abs(d).max(), 1e-300))
+            trial = space.step(x, d[None])
+            w_trial = problem.weighted(problem.raw(trial))
+            if (lower := float(_square(w_trial.r)[0])) < cost:
+                improved = True
+                break
+            shift *= 10
+        if not improved:
+            break
+        gain = cost - lower
+        x, w, cost, shift = trial, w_trial, lower, max(shift * 0.1, 1e-14)
+        if gain < 1e-15 * cost:
+            break
+    raw = problem.raw(x)
+    return Descent(x, raw.r, np.array([cost]), done, problem.met(raw.r))
+
+
+def _hessian(problem: Problem, q: Array, free: NDArray[np.intp]) -> Array:
+    """Second derivative (k, k) of half the cost along the freedoms `free`."""
+    h, k = 1e-5, len(free)
+    d = np.zeros((2 * k, problem.space.nv))
+    d[np.arange(k), free], d[np.arange(k, 2 * k), free] = h, -h
+    moved = _unclipped(problem, q, d)
+    w = problem.weighted(problem.raw(moved))
+    g = (w.r[:, None, :] @ w.J)[:, 0][:, free]
+    H = (g[:k] - g[k:]) / (2 * h)
+    return np.asarray(0.5 * (H + H.T))
+
+
+def _unclipped(problem: Problem, q: Array, d: Array) -> Array:
+    """Steps that may leave the limits a little: a derivative wants both sides."""
+    from .space import Space
+
+    return Space(problem.model, limits=False).step(np.tile(q, (len(d), 1)), d)

@@ -1,0 +1,269 @@
+"""Why goals were not met: bounds and closed forms first, then searches with parts of the question left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .closed_form import closed_form
+from .descend import Descent, descend, sharpen
+from .goals import Goal, Orientation, Pose, Position, Rows
+from .problem import Problem, freedom_names
+from .proofs import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
+from .search import Search
+from .settle import settle
+from .verdict import Verdict
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """A negative verdict with a solution outside the limits, if that is the reason, and the nearest pose.
+
+    `found`: a solution that the searches for reasons came upon after all.
+    """
+
+    verdict: Verdict
+    q_free: Array | None = None
+    nearest: Array | None = None
+    found: Array | None = None
+
+
+def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
+    """Verdict on a problem that no start solved; `nearest` is the best pose found."""
+    goals = problem.goals
+    gaps = {goal: goal_gap(problem, goal, search.start) for goal in goals}
+    blocked = [g for g in goals if _exceeds(gaps[g], g) and not _is_range(gaps[g])]
+    if blocked:
+        return _out_of_reach(problem, search, nearest, blocked[0], gaps[blocked[0]])
+    for a, b in pairs(goals):
+        gap = pair_gap(problem, a, b, search.start)
+        if _exceeds(gap, a, b):
+            return _conflict(problem, search, nearest, (a, b), gap)
+    free = _without_limits(problem, search, nearest)
+    if free is not None:
+        return _held(problem, search, nearest, free)
+    if len(goals) == 1:
+        return _out_of_reach(problem, search, nearest, goals[0], NO_GAP)
+    return _together(problem, search, nearest)
+
+
+def _exceeds(gap: Gap, *goals: Goal) -> bool:
+    """Whether a proved gap is larger than the goals' tolerances allow."""
+    room = sum(float(np.linalg.norm(t[np.isfinite(t)])) for t in (g.tolerances() for g in goals))
+    free = any(not np.isfinite(g.tolerances()).all() for g in goals)
+    return not free and (gap.position > room or gap.rotation > room)
+
+
+def _is_range(gap: Gap) -> bool:
+    return gap.by == "the joint's range"
+
+
+def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array | None:
+    """A solution (nq,) that leaves the limits as little as was found; None without any."""
+    free = problem.without_limits()
+    form = closed_form(free, search.start)
+    first = [search.best.q, nearest.q] + ([] if form is None else [form.q])
+    looking = Search(free, search.start, restarts=max(24, search.restarts // 2), seed=1)
+    found = looking.solutions(np.concatenate(first))
+    search.iterations += looking.iterations
+    if not len(found):
+        return None
+    found = free.space.nearest_turns(found, _middles(problem, search.start))
+    excess = problem.space.excess(found)
+    order = np.argsort(np.sum(excess**2, axis=1))[:3]
+
+    def beyond(q: Array) -> Rows:
+        r = problem.space.excess(q)
+        x = np.zeros_like(r)
+        x[:, problem.space.scalar_v] = q[:, problem.space.scalar_q]
+        sign = np.where(x > problem.space.high, 1.0, -1.0) * (r > 0)
+        return Rows(r, sign[:, :, None] * np.eye(problem.space.nv))
+
+    ends = [settle(free, found[i], beyond) for i in order]
+    return min(ends, key=lambda end: end.value).q
+
+
+def _middles(problem: Problem, start: Array) -> Array:
+    return problem.space.middle(start, problem.moved)
+
+
+def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Diagnosis:
+    """Limits are the reason, unless the solution found without them is inside after all."""
+    inside = descend(problem, problem.space.clip(free[None]))
+    if inside.met[0]:
+        verdict = Verdict("solved", True, "")
+        return Diagnosis(verdict, found=inside.q[0])
+    excess = problem.space.excess(free[None])[0]
+    joints = dict.fromkeys(freedom_names(problem.model, excess > 1e-09), 0.0)
+    for v in np.flatnonzero(excess > 1e-9):
+        name = freedom_names(problem.model, np.arange(problem.space.nv) == v)[0]
+        joints[name] = max(joints[name], float(excess[v]))
+    proved = _is_range_only(problem, search) or _proved_held(problem, search)
+    position, rotation = _sizes(problem, nearest.r)
+    names = " and ".join(f"{name} (by {far:.4g})" for name, far in joints.items())
+    reason = f"without limits they are met, with {names} outside; inside, {_words(position, rotation)} remain"
+    goals = tuple(g.label for g in problem.goals)
+    verdict = Verdict("held by limits", proved, reason, position, rotation, 0.0, joints, goals)
+    return Diagnosis(verdict, q_free=free, nearest=nearest.q[0])
+
+
+def _is_range_only(problem: Problem, search: Search) -> bool:
+    return any(_is_range(goal_gap(problem, g, search.start)) for g in problem.goals)
+
+
+def _proved_held(problem: Problem, search: Search) -> bool:
+    if closed_form_outside(problem, closed_form(problem, search.start)) is not None:
+        return True
+    return subdivision(problem)
+
+
+def _sizes(problem: Problem, r: Array) -> tuple[float, float]:
+    """Residuals (1, m) of judged goals in metres and radians."""
+    position = rotation = 0.0
+    for group in problem.groups:
+        if group.goal is not None:
+            p, w = group.goal.errors(r[:, group.rows])
+            position, rotation = float(np.hypot(position, p[0])), float(np.hypot(rotation, w[0]))
+    return position, rotation
+
+
+def _words(position: float, rotation: float) -> str:
+    parts = [f"{position:.6g} m"] * (position > 1e-9) + [f"{rotation:.6g} rad"] * (rotation > 1e-9)
+    return " and ".join(parts) or "nothing"
+
+
+def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal, gap: Gap) -> Diagnosis:
+    """One goal that cannot be met even without limits."""
+    alone = problem.only([goal])
+    position, rotation, q = _apart(alone, search, nearest if len(problem.goals) == 1 else None)
+    proved = gap != NO_GAP
+    by = gap.by
+    if not proved:
+        form = closed_form(alone, search.start)
+        outside = closed_form_outside(alone.without_limits(), form)
+        proved, by = outside is not None and not len(outside), form.structure if form is not None else ""
+    if not proved and subdivision(alone):
+        proved, by = True, "subdivision of its joints' ranges"
+    sure = search.agreed() >= 2 or proved
+    reason = f"{goal.label} cannot come nearer than {_words(position, rotation)}"
+    if isinstance(goal, Pose) and position > 1e-9 and rotation > 1e-9 and not gap.position:
+        reason = (
+            f"{goal.label}: position and orientation are met only apart: {position:.6g} m remain when turned "
+            f"right, {rotation:.6g} rad when placed right"
+        )
+    if proved:
+        reason += f", by {by}"
+    kind = "out of reach" if sure else "not found"
+    verdict = Verdict(kind, proved, reason, position, rotation, gap.position, None, (goal.label,))  # type: ignore[arg-type]
+    return Diagnosis(verdict, nearest=q if len(problem.goals) == 1 else nearest.q[0])
+
+
+def _apart(problem: Problem, search: Search, nearest: Descent | None) -> tuple[float, float, Array]:
+    """How far position and rotation of one goal stay away (see `Verdict`), and the nearest pose (nq,)."""
+    goal = problem.goals[0]
+    if not isinstance(goal, Pose):
+        end = nearest or _closest(problem, search)
+        return (*_sizes(problem, end.r), end.q[0])
+    keep = {"at": goal.at, "relative_to": goal.relative_to}
+    t = goal.tolerances()
+    place = problem.only([Position(target=goal.position, tolerance=tuple(t[:3]), **keep)])
+    turn = problem.only([Orientation(quat=goal.quat, tolerance=tuple(t[3:]), **keep)])
+    placed, turned = _closest(place, search), _closest(turn, search)
+    end = nearest or _closest(problem, search)
+    if not placed.met[0] or not turned.met[0]:
+        first = place if not placed.met[0] else turn
+        here = placed if not placed.met[0] else turned
+        position, rotation = _sizes(first, here.r)
+        if not placed.met[0] and not turned.met[0]:
+            rotation = _sizes(turn, turned.r)[1]
+        return position, rotation, end.q[0]
+    position = _least(turn, place, search, end)[0]
+    rotation, q = _least(place, turn, search, end)
+    return position, rotation, end.q[0] if q is None else end.q[0]
+
+
+def _closest(problem: Problem, search: Search) -> Descent:
+    """Nearest pose of a part of the question."""
+    part = Search(problem, search.start, restarts=min(search.restarts, 60), seed=2)
+    found = part.solutions(search.best.q[:6])
+    search.iterations += part.iterations
+    if len(found):
+        return descend(problem, found[:1])
+    ends = [sharpen(problem, q) for q in part.best.q[:2]]
+    return min(ends, key=lambda end: float(end.cost[0]))
+
+
+def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> tuple[float, Array | None]:
+    """Least residual of `wanted` while `held` is met, from several starts: a number in its own unit."""
+    starts = np.concatenate([end.q, search.best.q[:6]])
+    feasible = descend(held, starts)
+    part = Search(held, search.start, restarts=24, seed=3)
+    more = [feasible.q[feasible.met], part.solutions(np.zeros((0, held.space.nq)), every=True)]
+    q = np.concatenate(more)
+    if not len(q):
+        return 0.0, None
+
+    def wish(x: Array) -> Rows:
+        return wanted.weighted(wanted.raw(x))
+
+    value = np.sum(wish(q).r ** 2, axis=1)
+    ends = [settle(held, q[i], wish) for i in np.argsort(value)[:3]]
+    best = min(ends, key=lambda e: e.value)
+    position, rotation = _sizes(wanted, wanted.raw(best.q[None]).r)
+    return max(position, rotation), best.q
+
+
+def _conflict(
+    problem: Problem, search: Search, nearest: Descent, goals: tuple[Goal, ...], gap: Gap
+) -> Diagnosis:
+    """Goals that can be met, if at all, only without each other."""
+    proved = gap != NO_GAP
+    position, rotation = _sizes(problem, nearest.r)
+    names = tuple(g.label for g in goals)
+    reason = f"{' and '.join(names)} exclude each other; at best {_words(position, rotation)} remain"
+    if proved:
+        reason += f", {_words(gap.position, gap.rotation)} proved by {gap.by}"
+    else:
+        part = problem.only(goals)
+        proved = subdivision(part.without_limits())
+        reason += ", by subdivision of the joints' ranges" if proved else ""
+    verdict = Verdict("conflict", proved, reason, position, rotation, gap.position, None, names)
+    return Diagnosis(verdict, nearest=nearest.q[0])
+
+
+def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
+    """Several goals, not met even without limits: one that fails alone, or a smallest set in conflict."""
+    for goal in problem.goals:
+        alone = problem.only([goal])
+        if not _meets(alone, search):
+            free = _without_limits(alone, search, nearest)
+            part = Search(alone, search.start, restarts=search.restarts, seed=4)
+            found = part.solutions(search.best.q[:6])
+            if len(found):
+                continue
+            end = min((sharpen(alone, q) for q in part.best.q[:2]), key=lambda e: float(e.cost[0]))
+            inner = (
+                _out_of_reach(alone, part, end, goal, NO_GAP)
+                if free is None
+                else _held(alone, part, end, free)
+            )
+            search.iterations += part.iterations
+            if inner.found is None:
+                return Diagnosis(inner.verdict, inner.q_free, nearest.q[0])
+    core = list(problem.goals)
+    for goal in problem.goals:  # deletion filter: what is left cannot spare any goal
+        rest = [g for g in core if g is not goal]
+        if len(rest) > 1 and not _meets(problem.only(rest), search):
+            core = rest
+    return _conflict(problem, search, nearest, tuple(core), NO_GAP)
+
+
+def _meets(problem: Problem, search: Search) -> bool:
+    part = Search(problem, search.start, restarts=min(search.restarts, 100), seed=5)
+    met = len(part.solutions(search.best.q[:6])) > 0
+    search.iterations += part.iterations
+    return met

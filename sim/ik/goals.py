@@ -1,0 +1,459 @@
+# ruff: noqa: D102  (overridden methods are documented by Goal)
+"""Goals of inverse kinematics: what is wanted of frames, joints and the centre of mass.
+
+A goal gives residual rows, each in metres or radians, and their Jacobian by the tangent of q. Without a
+weight it is hard: it is met within its tolerance or the verdict is negative. With a weight it is a wish, met
+as well as the hard goals allow. Frames are named by text: `tip` is a site, `body:hand` a body.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...models.naming import lookup
+from .. import rotations
+from ..errors import ModelError
+from ..kinds import SCALAR
+from .pose import Configurations, Kinematics, Moving
+from .space import Space
+
+Array = NDArray[np.float64]
+Unit = Literal["m", "rad"]
+TOLERANCE = 1e-6
+BAND = 1e-4  # a larger tolerance is room that the answer may use
+
+
+class Rows(NamedTuple):
+    """Residuals r (n, m) and Jacobian J (n, m, nv)."""
+
+    r: Array
+    J: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Goal(ABC):
+    """Base of all goals.
+
+    `weight`: None for a hard goal. `name`: what reports call it. `tolerance`: of every row, or one per row
+    [m or rad]; above 1e-4 a band that the answer may lie anywhere in, `inf` leaves a row free.
+    """
+
+    weight: float | None = None
+    name: str = ""
+    tolerance: float | tuple[float, ...] = TOLERANCE
+
+    def __post_init__(self) -> None:
+        if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
+            raise ModelError(f"weight of goal {self.label!r} must be positive, or None for a hard goal")
+        if not (np.asarray(self.tolerance, dtype=float) > 0).all():
+            raise ModelError(f"tolerance of goal {self.label!r} must be positive, not {self.tolerance}")
+
+    @property
+    def label(self) -> str:
+        """Name, or kind and frame."""
+        return self.name or " ".join([type(self).__name__.lower(), *self.frames()])
+
+    @abstractmethod
+    def frames(self) -> tuple[str, ...]:
+        """Frames that the goal looks at."""
+
+    @abstractmethod
+    def units(self) -> tuple[Unit, ...]:
+        """Unit of every row before rows are left free."""
+
+    @abstractmethod
+    def rows(self, c: Configurations) -> Rows:
+        """Residuals and Jacobian over a batch."""
+
+    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
+        """Freedoms (nv,) that can change the goal."""
+        mask = np.zeros(kinematics.model.nv, dtype=bool)
+        for text in self.frames():
+            mask[kinematics.frame(text).dofs] = True
+        return mask
+
+    def tolerances(self) -> Array:
+        """Tolerance of every row (m,)."""
+        m = len(self.units())
+        t = np.asarray(self.tolerance, dtype=float)
+        if t.ndim and t.shape != (m,):
+            raise ModelError(f"goal {self.label!r} has {m} rows; its tolerance has shape {t.shape}")
+        return np.broadcast_to(t, (m,))
+
+    def errors(self, r: Array) -> tuple[Array, Array]:
+        """Size of residuals (n, m): (n,) in metres and (n,) in radians, free rows left out."""
+        kept = np.isfinite(self.tolerances())
+        metres = np.array([u == "m" for u in self.units()])
+        return _norm(r[:, metres & kept]), _norm(r[:, ~metres & kept])
+
+
+def _norm(x: Array) -> Array:
+    return np.asarray(np.linalg.norm(x, axis=1)) if x.shape[1] else np.zeros(len(x))
+
+
+def _vector(name: str, x: ArrayLike, n: int = 3) -> Array:
+    out = np.array(x, dtype=float)
+    if out.shape != (n,) or not np.isfinite(out).all():
+        raise ModelError(f"{name} must be {n} finite numbers, not {x!r}")
+    return out
+
+
+def _unit(name: str, x: ArrayLike, n: int = 3) -> Array:
+    out = _vector(name, x, n)
+    length = np.linalg.norm(out)
+    if length < 1e-12:
+        raise ModelError(f"{name} is zero: it gives no direction")
+    return np.asarray(out / length)
+
+
+def _seen_from(c: Configurations, at: str, base: str | None) -> Moving:
+    """Frame `at` in the frame `base` (None: the world), with Jacobians of that relative pose."""
+    f = c.frame(at)
+    if base is None:
+        return f
+    b = c.frame(base)
+    back = b.R.transpose(0, 2, 1)
+    arm = f.p - b.p
+    Jv = f.Jv - b.Jv + rotations.skew(arm) @ b.Jw  # the base's turning sweeps the arm: - w x arm
+    return Moving(back @ f.R, (back @ arm[..., None])[..., 0], back @ (f.Jw - b.Jw), back @ Jv)
+
+
+@dataclass(frozen=True, eq=False)
+class Position(Goal):
+    """The origin of `at` is at `target` (3,) [m], in world axes or those of `relative_to`."""
+
+    at: str
+    target: ArrayLike
+    relative_to: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "target", _vector("target", self.target))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",) * 3
+
+    def rows(self, c: Configurations) -> Rows:
+        f = _seen_from(c, self.at, self.relative_to)
+        return Rows(f.p - self.target, f.Jv)
+
+
+@dataclass(frozen=True, eq=False)
+class Orientation(Goal):
+    """`at` is turned as `quat` (4,) wxyz, in the world or in `relative_to`.
+
+    Residual: the rotation vector from target to frame in the target's axes [rad]; its tolerance is per axis.
+    """
+
+    at: str
+    quat: ArrayLike
+    relative_to: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("rad",) * 3
+
+    def rows(self, c: Configurations) -> Rows:
+        return _turn_rows(_seen_from(c, self.at, self.relative_to), np.asarray(self.quat))
+
+
+def _turn_rows(f: Moving, quat: Array) -> Rows:
+    """log(R_T^T R) in the target's axes; its derivative is J_left^-1 R_T^T w."""
+    R_T = rotations.to_matrix(quat)
+    phi = rotations.log(rotations.from_matrix(R_T.T @ f.R))
+    return Rows(phi, rotations.inverse_right_jacobian(-phi) @ (R_T.T @ f.Jw))
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(Goal):
+    """The frame `at` is at `position` (3,) [m] and turned as `quat` (4,) wxyz; six tolerances at most."""
+
+    at: str
+    position: ArrayLike
+    quat: ArrayLike
+    relative_to: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "position", _vector("position", self.position))
+        object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",) * 3 + ("rad",) * 3
+
+    def rows(self, c: Configurations) -> Rows:
+        f = _seen_from(c, self.at, self.relative_to)
+        turn = _turn_rows(f, np.asarray(self.quat))
+        return Rows(
+            np.concatenate([f.p - self.position, turn.r], axis=1), np.concatenate([f.Jv, turn.J], axis=1)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LookAt(Goal):
+    """The local `axis` of `at` points to the world point `target`.
+
+    Residual: difference of the unit vectors of axis and sight, 2 sin(angle / 2) long.
+    """
+
+    at: str
+    target: ArrayLike
+    axis: ArrayLike = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "target", _vector("target", self.target))
+        object.__setattr__(self, "axis", _unit("axis", self.axis))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("rad",) * 3
+
+    def rows(self, c: Configurations) -> Rows:
+        f = c.frame(self.at)
+        a = f.R @ np.asarray(self.axis)
+        sight = self.target - f.p
+        far = np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        d = sight / far
+        Jd = -(f.Jv - d[:, :, None] * (d[:, None, :] @ f.Jv)) / far[:, :, None]
+        return Rows(a - d, -rotations.skew(a) @ f.Jw - Jd)
+
+    def errors(self, r: Array) -> tuple[Array, Array]:
+        return np.zeros(len(r)), 2 * np.arcsin(np.minimum(1.0, 0.5 * _norm(r)))
+
+
+@dataclass(frozen=True, eq=False)
+class PointOnLine(Goal):
+    """The origin of `at` lies on the line through `point` along `direction`."""
+
+    at: str
+    point: ArrayLike
+    direction: ArrayLike
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "direction", _unit("direction", self.direction))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",) * 2
+
+    def rows(self, c: Configurations) -> Rows:
+        f = c.frame(self.at)
+        across = np.linalg.svd(np.asarray(self.direction)[None])[2][1:]  # two unit vectors across the line
+        return Rows((f.p - self.point) @ across.T, across @ f.Jv)
+
+
+@dataclass(frozen=True, eq=False)
+class PointOnPlane(Goal):
+    """The origin of `at` lies in the plane through `point` with unit `normal`."""
+
+    at: str
+    point: ArrayLike
+    normal: ArrayLike
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "normal", _unit("normal", self.normal))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at,)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",)
+
+    def rows(self, c: Configurations) -> Rows:
+        f, n = c.frame(self.at), np.asarray(self.normal)
+        return Rows((f.p - self.point) @ n[:, None], n[None] @ f.Jv)
+
+
+@dataclass(frozen=True, eq=False)
+class Distance(Goal):
+    """The origins of `at` and `to` (a frame, or a world point) are `distance` [m] apart."""
+
+    at: str
+    to: str | ArrayLike
+    distance: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.to, str):
+            object.__setattr__(self, "to", _vector("to", self.to))
+        if not self.distance >= 0:
+            raise ModelError(f"a distance is not negative: {self.distance}")
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at, self.to) if isinstance(self.to, str) else (self.at,)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",)
+
+    def rows(self, c: Configurations) -> Rows:
+        f = c.frame(self.at)
+        p, J = f.p, f.Jv
+        if isinstance(self.to, str):
+            other = c.frame(self.to)
+            p, J = p - other.p, J - other.Jv
+        else:
+            p = p - np.asarray(self.to)
+        long = _norm(p)
+        u = p / np.maximum(long, 1e-12)[:, None]
+        return Rows(long[:, None] - self.distance, u[:, None, :] @ J)
+
+
+@dataclass(frozen=True, eq=False)
+class CenterOfMass(Goal):
+    """The centre of mass of everything that moves is at `target` (3,) [m]; tolerances free an axis by inf."""
+
+    target: ArrayLike
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "target", _vector("target", self.target))
+        super().__post_init__()
+
+    @property
+    def label(self) -> str:
+        return self.name or "centre of mass"
+
+    def frames(self) -> tuple[str, ...]:
+        return ()
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",) * 3
+
+    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
+        mask = np.zeros(kinematics.model.nv, dtype=bool)
+        for _, f in kinematics.masses():
+            mask[f.dofs] = True
+        return mask
+
+    def rows(self, c: Configurations) -> Rows:
+        p, J = c.center_of_mass()
+        return Rows(p - self.target, J)
+
+
+@dataclass(frozen=True, eq=False)
+class JointValue(Goal):
+    """The hinge or slide `joint` stands at `value` [rad or m]."""
+
+    joint: str
+    value: float
+
+    @property
+    def label(self) -> str:
+        return self.name or f"joint {self.joint}"
+
+    def frames(self) -> tuple[str, ...]:
+        return ()
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("rad",)
+
+    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
+        mask = np.zeros(kinematics.model.nv, dtype=bool)
+        mask[_scalar_joint(kinematics, self.joint)[1]] = True
+        return mask
+
+    def rows(self, c: Configurations) -> Rows:
+        q, v = _scalar_joint(c.kinematics, self.joint)
+        J = np.zeros((len(c.q), 1, c.model.nv))
+        J[:, 0, v] = 1.0
+        return Rows(c.q[:, q : q + 1] - self.value, J)
+
+
+def _scalar_joint(kinematics: Kinematics, name: str) -> tuple[int, int]:
+    model = kinematics.model
+    j = lookup(model, "joint", name)
+    if int(model.jnt_type[j]) not in SCALAR:
+        raise ModelError(f"joint {name!r} is no hinge or slide: it has no single value")
+    return int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+
+
+@dataclass(frozen=True, eq=False)
+class Posture(Goal):
+    """The whole configuration is `q` (nq,); nearly always a wish, so give it a weight."""
+
+    q: ArrayLike
+
+    @property
+    def label(self) -> str:
+        return self.name or "posture"
+
+    def frames(self) -> tuple[str, ...]:
+        return ()
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("rad",)
+
+    def errors(self, r: Array) -> tuple[Array, Array]:
+        return np.zeros(len(r)), _norm(r)
+
+    def tolerances(self) -> Array:
+        return np.full(1, self.tolerance, dtype=float)
+
+    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
+        return np.ones(kinematics.model.nv, dtype=bool)
+
+    def rows(self, c: Configurations) -> Rows:
+        space = Space(c.model)
+        d = space.difference(c.q, np.asarray(self.q, dtype=float)[None])
+        J = np.tile(np.eye(c.model.nv), (len(d), 1, 1))
+        for ball in space.balls:
+            v = slice(ball.v, ball.v + 3)
+            J[:, v, v] = rotations.inverse_right_jacobian(d[:, v])
+        return Rows(d, J)
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror(Goal):
+    """The origin of `at` is the mirror image of that of `of` in the plane through `point` along `normal`.
+
+    With `relative_to`, the plane is fixed in that frame, so that a limb mirrors another on a turned trunk.
+    """
+
+    at: str
+    of: str
+    normal: ArrayLike = (0.0, 1.0, 0.0)
+    point: ArrayLike = (0.0, 0.0, 0.0)
+    relative_to: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "normal", _unit("normal", self.normal))
+        object.__setattr__(self, "point", _vector("point", self.point))
+
+    def frames(self) -> tuple[str, ...]:
+        return (self.at, self.of) if self.relative_to is None else (self.at, self.of, self.relative_to)
+
+    def units(self) -> tuple[Unit, ...]:
+        return ("m",) * 3
+
+    def rows(self, c: Configurations) -> Rows:
+        f, g = (_seen_from(c, at, self.relative_to) for at in (self.at, self.of))
+        n = np.asarray(self.normal)
+        S = np.eye(3) - 2 * np.outer(n, n)
+        image = (g.p - self.point) @ S + self.point
+        return Rows(f.p - image, f.Jv - S @ g.Jv)

@@ -1,0 +1,113 @@
+"""Poses, Jacobians and centre of mass that goals ask for, over a batch of configurations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...models.naming import lookup, name_of
+from ..errors import ModelError
+from ..kinematics import Frame, FrameKind, frame
+
+Array = NDArray[np.float64]
+
+
+class Moving(NamedTuple):
+    """A frame over a batch: R_WF (n, 3, 3), p_WF (n, 3), and its angular and linear Jacobians (n, 3, nv)."""
+
+    R: Array
+    p: Array
+    Jw: Array
+    Jv: Array
+
+
+def parse_frame(text: str) -> tuple[FrameKind, str]:
+    """Kind and name of a frame: `tip` is a site; `body:hand`, `geom:pad`, `camera:eye` say their kind."""
+    kind, colon, name = text.partition(":")
+    if colon and kind in ("body", "site", "geom", "camera"):
+        return kind, name  # type: ignore[return-value]
+    return "site", text
+
+
+class Kinematics:
+    """Frames of one model, found once."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self.model = model
+        self._frames: dict[str, Frame] = {}
+        self._mass: list[tuple[float, Frame]] | None = None
+
+    def frame(self, text: str) -> Frame:
+        """The frame of a text as in `parse_frame`; ModelError (lists what exists) for an unknown one."""
+        if text not in self._frames:
+            self._frames[text] = frame(self.model, *parse_frame(text))
+        return self._frames[text]
+
+    def anchored(self, body: int, p: ArrayLike, quat: ArrayLike | None = None) -> str:
+        """Key of a frame fixed at `p`, `quat` in a body."""
+        key = f"body {body} {np.asarray(p).tolist()} {None if quat is None else np.asarray(quat).tolist()}"
+        if key not in self._frames:
+            base = frame(self.model, "body", name_of(self.model, "body", body))
+            R = np.empty(9)
+            mujoco.mju_quat2Mat(R, np.array([1.0, 0, 0, 0] if quat is None else quat, dtype=float))
+            X = np.eye(4)
+            X[:3, :3], X[:3, 3] = R.reshape(3, 3), p
+            self._frames[key] = replace(base, X_end=base.X_end @ X)
+        return key
+
+    def masses(self) -> list[tuple[float, Frame]]:
+        """Mass and centre of every body that moves and weighs something."""
+        if self._mass is None:
+            self._mass = []
+            for b in range(1, self.model.nbody):
+                f = self._frames[self.anchored(b, self.model.body_ipos[b])]
+                if self.model.body_mass[b] > 0 and f.joints:
+                    self._mass.append((float(self.model.body_mass[b]), f))
+            if not self._mass:
+                raise ModelError("nothing that moves has mass in this model: a centre of mass means nothing")
+        return self._mass
+
+    def body_of(self, text: str) -> int:
+        """Body that carries a frame."""
+        kind, name = parse_frame(text)
+        index = lookup(self.model, kind, name)
+        if kind == "body":
+            return index
+        field = {"site": "site", "geom": "geom", "camera": "cam"}[kind]
+        return int(getattr(self.model, f"{field}_bodyid")[index])
+
+    def at(self, q: Array) -> Configurations:
+        """The batch q (n, nq)."""
+        return Configurations(self, q)
+
+
+class Configurations:
+    """A batch of configurations; each frame is computed when first asked for."""
+
+    def __init__(self, kinematics: Kinematics, q: Array):
+        self.kinematics, self.model, self.q = kinematics, kinematics.model, q
+        self._known: dict[str, Moving] = {}
+
+    def frame(self, text: str) -> Moving:
+        """A frame by its text (see `parse_frame`)."""
+        if text not in self._known:
+            self._known[text] = moving(self.kinematics.frame(text), self.q)
+        return self._known[text]
+
+    def center_of_mass(self) -> tuple[Array, Array]:
+        """Centre of mass of everything that moves (n, 3) and its Jacobian (n, 3, nv)."""
+        total, p, J = 0.0, np.zeros((len(self.q), 3)), np.zeros((len(self.q), 3, self.model.nv))
+        for mass, f in self.kinematics.masses():
+            m = moving(f, self.q)
+            total, p, J = total + mass, p + mass * m.p, J + mass * m.Jv
+        return p / total, J / total
+
+
+def moving(f: Frame, q: Array) -> Moving:
+    """Pose and Jacobian of a frame."""
+    X, J = f.pose(q), f.jacobian(q)
+    return Moving(X[:, :3, :3], X[:, :3, 3], J[:, :3], J[:, 3:])

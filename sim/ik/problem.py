@@ -1,0 +1,163 @@
+"""Goals and the model's equalities as one system of residual rows over a batch of configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ...models.naming import joint_names, lookup, name_of
+from ..errors import ModelError, unknown
+from .goals import BAND, Goal, Posture, Rows
+from .loops import Closure, closures
+from .pose import Kinematics
+from .space import Space
+
+Array = NDArray[np.float64]
+
+
+class Group(NamedTuple):
+    """Rows of one goal or one loop of the model in the whole system."""
+
+    label: str
+    goal: Goal | None
+    rows: slice
+
+
+class Problem:
+    """Residuals of hard and wished rows of `goals` on `model`.
+
+    Attributes:
+        groups: where each goal's rows are; loops of the model come last.
+        judged (m,): rows that must vanish: of hard goals (of all goals when none is hard) and of loops.
+        tolerance (m,): of every row.
+        moved (nv,): freedoms that may change.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        goals: Sequence[Goal],
+        space: Space,
+        *,
+        joints: Sequence[str] | None = None,
+        kinematics: Kinematics | None = None,
+    ):
+        if not goals:
+            raise ModelError("inverse kinematics needs at least one goal")
+        self.model, self.space, self.goals = model, space, tuple(goals)
+        self.kinematics = kinematics or Kinematics(model)
+        wanted = np.zeros(model.nv, dtype=bool)
+        for goal in goals:
+            wanted |= goal.moved(self.kinematics)
+        self.loops = _touched(closures(model, self.kinematics), wanted)
+        self.moved = wanted & _allowed(model, joints)
+        self._layout()
+
+    def _layout(self) -> None:
+        hard = [g.weight is None for g in self.goals]
+        strict = hard if any(hard) else [True] * len(hard)
+        scale = length_of(self.model, self.kinematics, self.goals)
+        groups, judged, tolerance, weight, band, metres = [], [], [], [], [], []
+        at = 0
+        for goal, judge in zip(self.goals, strict, strict=True):
+            t = goal.tolerances()
+            is_metres = np.array([u == "m" for u in goal.units()])
+            if isinstance(goal, Posture):  # a row for every freedom
+                t, is_metres = np.full(self.model.nv, t[0]), np.zeros(self.model.nv, dtype=bool)
+            units = np.where(is_metres, 1.0 / scale, 1.0)
+            groups.append(Group(goal.label, goal, slice(at, at + len(t))))
+            metres.append(is_metres)
+            at += len(t)
+            judged.append(np.full(len(t), judge) & np.isfinite(t))
+            tolerance.append(t)
+            weight.append(units * (1.0 if goal.weight is None else np.sqrt(goal.weight)))
+            band.append(np.where(t > BAND, 0.99 * t, 0.0))
+        for loop in self.loops:
+            m = len(loop.tolerance)
+            metres.append(loop.metres)
+            groups.append(Group(loop.label, None, slice(at, at + m)))
+            at += m
+            judged.append(np.ones(m, dtype=bool))
+            tolerance.append(loop.tolerance)
+            weight.append(np.where(loop.metres, 1.0 / scale, 1.0))
+            band.append(np.zeros(m))
+        self.groups, self.m = tuple(groups), at
+        self.judged, self.tolerance = np.concatenate(judged), np.concatenate(tolerance)
+        self.weight, self.band = np.concatenate(weight), np.concatenate(band)
+        self.metres, self.scale = np.concatenate(metres).astype(bool), scale
+
+    def raw(self, q: Array) -> Rows:
+        """Residuals (n, m) [m or rad] and Jacobian (n, m, nv), without weights."""
+        c = self.kinematics.at(q)
+        parts = [g.rows(c) for g in self.goals] + [loop.rows(c) for loop in self.loops]
+        J = np.concatenate([p.J for p in parts], axis=1)
+        J[:, :, ~self.moved] = 0.0
+        return Rows(np.concatenate([p.r for p in parts], axis=1), J)
+
+    def weighted(self, rows: Rows) -> Rows:
+        """Rows as the solver sees them: bands taken off, free rows zero, metres over the model's length."""
+        inside = np.clip(rows.r, -self.band, self.band)
+        w = np.where(np.isfinite(self.tolerance), self.weight, 0.0)
+        live = w * ((rows.r != inside) | (self.band == 0))
+        return Rows(np.where(live > 0, rows.r - inside, 0.0) * w, rows.J * live[:, :, None])
+
+    def met(self, r: Array) -> NDArray[np.bool_]:
+        """Which configurations (n,) meet everything that is judged."""
+        fine = (np.abs(r) <= self.tolerance) | ~self.judged
+        return np.asarray(fine.all(axis=1) & np.isfinite(r).all(axis=1))
+
+    def only(self, goals: Sequence[Goal]) -> Problem:
+        """The same model and freedoms with other goals."""
+        out = Problem(self.model, goals, self.space, kinematics=self.kinematics)
+        out.moved &= self.moved
+        return out
+
+    def without_limits(self) -> Problem:
+        """The same goals without joint limits."""
+        out = Problem(self.model, self.goals, Space(self.model, limits=False), kinematics=self.kinematics)
+        out.moved &= self.moved
+        return out
+
+
+def length_of(model: mujoco.MjModel, kinematics: Kinematics, goals: Sequence[Goal]) -> float:
+    """Length that makes metres and radians alike: half the longest stretched chain of the goals [m]."""
+    longest = 0.0
+    for goal in goals:
+        for text in goal.frames():
+            f = kinematics.frame(text)
+            offsets = [j.X[:3, 3] for j in f.joints[1:]] + [f.X_end[:3, 3]]
+            longest = max(longest, sum(float(np.linalg.norm(p)) for p in offsets))
+    return 0.5 * longest if longest > 1e-6 else max(0.5 * float(model.stat.extent), 1e-3)
+
+
+def _touched(loops: list[Closure], moved: NDArray[np.bool_]) -> list[Closure]:
+    """Loops that share freedoms with `moved`, which grows by theirs, and by those of the loops that they touch."""
+    rest, out = list(loops), []
+    while near := [loop for loop in rest if (loop.moved & moved).any()]:
+        for loop in near:
+            moved |= loop.moved
+            rest.remove(loop)
+            out.append(loop)
+    return out
+
+
+def _allowed(model: mujoco.MjModel, joints: Sequence[str] | None) -> NDArray[np.bool_]:
+    if joints is None:
+        return np.ones(model.nv, dtype=bool)
+    mask = np.zeros(model.nv, dtype=bool)
+    for name in joints:
+        if name not in joint_names(model):
+            raise ModelError(unknown("joint", name, joint_names(model)))
+        mask |= model.dof_jntid == lookup(model, "joint", name)
+    return mask
+
+
+def freedom_names(model: mujoco.MjModel, mask: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Names of the joints of the freedoms in `mask` (nv,)."""
+    return tuple(
+        dict.fromkeys(name_of(model, "joint", int(model.dof_jntid[v])) for v in np.flatnonzero(mask))
+    )

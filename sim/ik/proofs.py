@@ -1,0 +1,286 @@
+"""Proofs that goals cannot be met: distances that no joint changes, closed forms, subdivision of small spaces."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import rotations
+from ..kinds import HINGE, SLIDE
+from ..kinematics import Frame
+from .closed_form import ClosedForm
+from .goals import (
+    Distance,
+    Goal,
+    JointValue,
+    LookAt,
+    Orientation,
+    PointOnLine,
+    PointOnPlane,
+    Pose,
+    Position,
+    _scalar_joint,
+)
+from .problem import Problem
+from .reach import at_point, offset, path, placed, planar, reach, turning_gap
+
+Array = NDArray[np.float64]
+_BOXES = 40_000
+_DEEP = 24
+
+
+class Gap(NamedTuple):
+    """Proved least violation of goals: metres and radians, with what proves it."""
+
+    position: float
+    rotation: float
+    by: str
+
+
+NO_GAP = Gap(0.0, 0.0, "")
+
+
+def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
+    """Least violation of one goal that the lengths of its chain prove, limits of hinges left aside."""
+    position = rotation = 0.0
+    by = ""
+    if isinstance(goal, (Position, Pose)):
+        target = goal.target if isinstance(goal, Position) else goal.position
+        position = _between(problem, _base(problem, goal.relative_to, np.asarray(target)), goal.at, q)
+        by = "the reach of the chain"
+    if isinstance(goal, (Orientation, Pose)):
+        rotation = _turning(problem, goal, q)
+        by = by if position > 0 or rotation == 0 else "the axes of the chain"
+    if isinstance(goal, Distance):
+        ends = problem.kinematics.frame(goal.at), _end(problem, goal.to)
+        hops = path(*ends, problem.space, problem.moved, q)
+        position, by = (0.0 if hops is None else reach(hops).gap(goal.distance)), "the reach of the chain"
+    if isinstance(goal, (PointOnPlane, PointOnLine)):
+        position, by = _surface_gap(problem, goal, q), "the reach of the chain"
+    if isinstance(goal, JointValue):
+        at, v = _scalar_joint(problem.kinematics, goal.joint)
+        low, high = problem.space.low[v], problem.space.high[v]
+        rotation, by = max(0.0, low - goal.value, goal.value - high), "the joint's range"
+    return Gap(position, rotation, by) if position > 0 or rotation > 0 else NO_GAP
+
+
+def _base(problem: Problem, relative_to: str | None, p: Array) -> Frame:
+    if relative_to is None:
+        return at_point(p, problem.space.nq, problem.space.nv)
+    return offset(problem.kinematics.frame(relative_to), p)
+
+
+def _end(problem: Problem, to: object) -> Frame:
+    return problem.kinematics.frame(to) if isinstance(to, str) else _base(problem, None, np.asarray(to))
+
+
+def _between(problem: Problem, base: Frame, at: str, q: Array) -> float:
+    hops = path(base, problem.kinematics.frame(at), problem.space, problem.moved, q)
+    return 0.0 if hops is None else reach(hops).low
+
+
+def _turning(problem: Problem, goal: Orientation | Pose, q: Array) -> float:
+    """Angle that a chain of parallel axes cannot make up."""
+    f = problem.kinematics.frame(goal.at)
+    base = None if goal.relative_to is None else problem.kinematics.frame(goal.relative_to)
+    joints = [j for j in f.joints] + ([] if base is None else list(base.joints))
+    turning = [j for j in joints if problem.moved[j.v] and int(j.type) != SLIDE]
+    if any(int(j.type) != HINGE for j in turning):
+        return 0.0
+    R = _rotation(f, q) if base is None else _rotation(base, q).T @ _rotation(f, q)
+    axes = [_axis(g, j, q) for g in ([f] if base is None else [f, base]) for j in g.joints if j in turning]
+    if any(np.linalg.norm(np.cross(a, axes[0])) > 1e-9 for a in axes):
+        return 0.0
+    axis = axes[0] if axes else None
+    if base is not None and axis is not None:
+        axis = _rotation(base, q).T @ axis
+    gap = turning_gap(axis, False, R, np.asarray(goal.quat))
+    return gap if gap > 1e-9 else 0.0
+
+
+def _rotation(f: Frame, q: Array) -> Array:
+    return np.asarray(f.pose(q)[:3, :3])
+
+
+def _axis(f: Frame, joint: object, q: Array) -> Array:
+    """Direction of a hinge in the world at q; along parallel axes it is the same at every q."""
+    J = f.jacobian(q)
+    return np.asarray(J[:3, joint.v])  # type: ignore[attr-defined]
+
+
+def _surface_gap(problem: Problem, goal: PointOnPlane | PointOnLine, q: Array) -> float:
+    """Distance of plane or line from the ball around the first anchor that the chain stays within."""
+    f = problem.kinematics.frame(goal.at)
+    base = at_point(np.asarray(goal.point), problem.space.nq, problem.space.nv)
+    hops = path(base, f, problem.space, problem.moved, q)
+    if hops is None or hops.hops[0].travels or not hops.turns:
+        return 0.0
+    first = hops.hops[0].vector  # from the goal's point to the first anchor, in the world
+    if isinstance(goal, PointOnPlane):
+        far = abs(float(first @ np.asarray(goal.normal)))
+    else:
+        along = np.asarray(goal.direction)
+        far = float(np.linalg.norm(first - (first @ along) * along))
+    radius = sum(h.lengths()[1] for h in hops.hops[1:])
+    return max(0.0, far - radius)
+
+
+def pair_gap(problem: Problem, a: Goal, b: Goal, q: Array) -> Gap:
+    """Least sum of violations of two goals, where the chain between their frames proves one."""
+    if isinstance(a, (Position, Pose)) and isinstance(b, (Position, Pose)) and _same_base(a, b):
+        targets = [np.asarray(g.target if isinstance(g, Position) else g.position) for g in (a, b)]
+        frames = [problem.kinematics.frame(g.at) for g in (a, b)]
+        hops = path(frames[0], frames[1], problem.space, problem.moved, q)
+        if hops is not None:
+            gap = reach(hops).gap(float(np.linalg.norm(targets[0] - targets[1])))
+            if gap > 0:
+                return Gap(gap, 0.0, "the chain between their frames")
+    if isinstance(a, (Orientation, Pose)) and isinstance(b, (Orientation, Pose)) and _same_base(a, b):
+        return _turn_conflict(problem, a, b, q)
+    if isinstance(a, JointValue) and isinstance(b, JointValue) and a.joint == b.joint and a.value != b.value:
+        return Gap(0.0, abs(a.value - b.value), "one joint")
+    return NO_GAP
+
+
+def _same_base(a: Position | Orientation | Pose, b: Position | Orientation | Pose) -> bool:
+    return a.relative_to == b.relative_to
+
+
+def _turn_conflict(problem: Problem, a: Orientation | Pose, b: Orientation | Pose, q: Array) -> Gap:
+    """Two orientations of frames that no turning joint lies between."""
+    f, g = (problem.kinematics.frame(x.at) for x in (a, b))
+    ours = {j.q for j in f.joints if problem.moved[j.v] and int(j.type) != SLIDE}
+    theirs = {j.q for j in g.joints if problem.moved[j.v] and int(j.type) != SLIDE}
+    if ours != theirs:
+        return NO_GAP
+    R = _rotation(f, q).T @ _rotation(g, q)
+    wanted = rotations.to_matrix(a.quat).T @ rotations.to_matrix(b.quat)
+    angle = float(np.linalg.norm(rotations.log(rotations.from_matrix(wanted.T @ R))))
+    return Gap(0.0, angle, "one link") if angle > 1e-9 else NO_GAP
+
+
+def pairs(goals: tuple[Goal, ...]) -> list[tuple[Goal, Goal]]:
+    """All pairs of goals."""
+    return list(combinations(goals, 2))
+
+
+def closed_form_outside(problem: Problem, form: ClosedForm | None) -> Array | None:
+    """Solutions (k, nq) of a complete closed form when all of them are outside the limits; else None.
+
+    k = 0: there is no solution at all. Solutions within 1e-7 of the limits prove nothing.
+    """
+    if form is None or not form.complete:
+        return None
+    from .space import Space
+
+    free = Space(problem.model, limits=False)
+    q = free.clip(form.q) if len(form.q) else form.q
+    if len(q):
+        r = problem.raw(q).r
+        near = (np.abs(r) <= np.maximum(1e-6, problem.tolerance)) | ~problem.judged
+        q = q[near.all(axis=1)]
+    if not len(q):
+        return q
+    outside = problem.space.excess(q).max(axis=1)
+    return q if (outside > 1e-7).all() else None
+
+
+def subdivision(problem: Problem, *, boxes: int = _BOXES) -> bool:
+    """Whether a subdivision of the limited range of at most four joints proves that nothing meets the goals.
+
+    In a box around q_c with half widths h, a point moves at most sum_j h_j R_j, R_j the farthest it can be
+    from joint j's axis; directions and angles at most sum_j h_j. A box whose residual at the centre is larger
+    than that and the tolerance holds no solution.
+    """
+    columns = np.flatnonzero(problem.moved)
+    low, high = problem.space.low[columns], problem.space.high[columns]
+    low, high = _whole_turns(problem, columns, low, high)
+    if problem.loops or not 1 <= len(columns) <= 4 or not np.isfinite([low, high]).all():
+        return False
+    rates = [_rates(problem, g, columns) for g in problem.goals]
+    if any(rate is None for rate in rates):
+        return False
+    q0 = problem.space.clip(problem.model.qpos0[None])[0]
+    centre, half = 0.5 * (low + high)[None], 0.5 * (high - low)[None]
+    seen = 0
+    for _ in range(_DEEP * len(columns)):
+        seen += len(centre)
+        if seen > boxes:
+            return False
+        q = np.tile(q0, (len(centre), 1))
+        q[:, problem.space.q_of_v[columns]] = centre
+        r = problem.raw(q).r
+        alive = np.ones(len(centre), dtype=bool)
+        for goal, group, rate in zip(problem.goals, problem.groups, rates, strict=True):
+            position, rotation = goal.errors(r[:, group.rows])
+            room = half @ rate  # type: ignore[operator]
+            slack = np.linalg.norm(np.where(np.isfinite(goal.tolerances()), goal.tolerances(), 0.0))
+            alive &= (position <= room[:, 0] + slack) & (rotation <= room[:, 1] + slack)
+        centre, half = centre[alive], half[alive]
+        if not len(centre):
+            return True
+        reach_of = half * np.maximum(sum(r.sum(axis=1) for r in rates), 1e-12)  # type: ignore[union-attr, misc, arg-type]
+        widest = np.argmax(reach_of, axis=1)
+        step = np.zeros_like(half)
+        step[np.arange(len(half)), widest] = 0.5 * half[np.arange(len(half)), widest]
+        half = half - step
+        centre, half = np.concatenate([centre - step, centre + step]), np.concatenate([half, half])
+    return False
+
+
+def _whole_turns(problem: Problem, columns: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Ranges with one whole turn for hinges that have no limits."""
+    hinge = np.isin(columns, problem.space.hinges)
+    return np.where(hinge & ~np.isfinite(low), -np.pi, low), np.where(hinge & ~np.isfinite(high), np.pi, high)
+
+
+def _rates(problem: Problem, goal: Goal, columns: Array) -> Array | None:
+    """Bounds (k, 2) on how fast the goal's metres and radians change with each joint, or None."""
+    if not isinstance(goal, (Position, Orientation, Pose, Distance, JointValue)):
+        return None
+    out = np.zeros((len(columns), 2))
+    if isinstance(goal, JointValue):
+        out[columns == _scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
+        return out
+    if getattr(goal, "relative_to", None) is not None:
+        return None
+    for text in goal.frames():
+        f = problem.kinematics.frame(text)
+        for k, joint in enumerate(f.joints):
+            if joint.v not in columns:
+                continue
+            row = int(np.flatnonzero(columns == joint.v)[0])
+            if int(joint.type) == SLIDE:
+                out[row, 0] += 1.0
+                continue
+            if int(joint.type) != HINGE:
+                return None
+            out[row] += [_farthest(problem, f, k), 1.0]
+    return out
+
+
+def _farthest(problem: Problem, f: Frame, k: int) -> float:
+    """Greatest distance of a frame's origin from the anchor of its k-th joint [m]."""
+    total = float(np.linalg.norm(f.X_end[:3, 3]))
+    for joint in f.joints[k + 1 :]:
+        total += float(np.linalg.norm(joint.X[:3, 3]))
+        if int(joint.type) == SLIDE:
+            span = problem.space.low[joint.v] - joint.rest, problem.space.high[joint.v] - joint.rest
+            total += max(abs(span[0]), abs(span[1]))
+    return total
+
+
+__all__ = [
+    "Gap",
+    "LookAt",
+    "closed_form_outside",
+    "goal_gap",
+    "pair_gap",
+    "pairs",
+    "placed",
+    "planar",
+    "subdivision",
+]  # fmt: skip

@@ -1,0 +1,75 @@
+"""Restarts: seeded random starts of damped least squares, until one meets the goals or none is left."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .descend import Descent, descend
+from .problem import Problem
+
+Array = NDArray[np.float64]
+_BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found
+
+
+class Search:
+    """One search over starts: what it found, what came nearest, and what it cost.
+
+    Attributes:
+        best: the nearest ends so far, nearest first (at most 12).
+        used, iterations: random starts and iterations so far.
+        ends: costs of all attempts that failed.
+    """
+
+    def __init__(self, problem: Problem, start: Array, *, restarts: int, seed: int):
+        self.problem, self.start, self.restarts = problem, start, restarts
+        self.rng = np.random.default_rng(seed)
+        self.used = self.iterations = 0
+        self.ends: list[float] = []
+        m = problem.m
+        self.best = Descent(
+            np.zeros((0, problem.space.nq)), np.zeros((0, m)), np.zeros(0), 0, np.zeros(0, dtype=bool)
+        )
+
+    def solutions(self, first: Array, *, every: bool = False) -> Array:
+        """Configurations (k, nq) that meet the problem: from `first` (k, nq), the start, then random starts.
+
+        All that were found, so possibly many alike; none (0, nq) when all restarts failed. With `every`, all
+        restarts are used.
+        """
+        space, moved = self.problem.space, self.problem.moved
+        found = []
+        if len(first):
+            found.append(self._attempt(space.clip(first), first=False))
+        starts = np.stack([self.start, space.middle(self.start, moved)])
+        if not len(first) or every or not len(found[0]):
+            found.append(self._attempt(starts, first=False))
+        blocks = iter(_BLOCKS)
+        size = next(blocks)
+        while self.used < self.restarts and (every or not sum(map(len, found))):
+            n = min(size, self.restarts - self.used)
+            q = space.random(self.rng, n, self.start, moved)
+            self.used += n
+            found.append(self._attempt(q, first=not every))
+            size = next(blocks, size)
+        return np.concatenate(found) if found else np.zeros((0, space.nq))
+
+    def _attempt(self, q: Array, *, first: bool) -> Array:
+        end = descend(self.problem, q, first=first)
+        self.iterations += end.iterations
+        self.ends += end.cost[~end.met].tolist()
+        self._remember(end)
+        return end.q[end.met]
+
+    def _remember(self, end: Descent) -> None:
+        both = [np.concatenate(pair) for pair in zip(self.best[:3], end[:3], strict=True)]
+        met = np.concatenate([self.best.met, end.met])
+        order = np.argsort(both[2], kind="stable")[:12]
+        self.best = Descent(both[0][order], both[1][order], both[2][order], 0, met[order])
+
+    def agreed(self) -> int:
+        """How many failed attempts ended as near as the nearest, within 0.1 %."""
+        if not self.ends:
+            return 0
+        least = min(self.ends)
+        return int(np.sum(np.array(self.ends) <= least * 1.001 + 1e-15))

@@ -1,0 +1,176 @@
+"""Inverse kinematics once: a configuration that meets goals, or a verdict why there is none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .closed_form import candidates
+from .descend import Descent, sharpen
+from .diagnose import diagnose
+from .goals import Goal
+from .preferences import Preference, Wishes, preference
+from .problem import Problem
+from .search import Search
+from .settle import Wish, settle
+from .space import Space
+from .verdict import Residual, Solution, Verdict
+
+Array = NDArray[np.float64]
+
+
+def solve(
+    model: mujoco.MjModel,
+    goals: Goal | Sequence[Goal],
+    *,
+    q0: ArrayLike | None = None,
+    joints: Sequence[str] | None = None,
+    prefer: Preference = "near",
+    obstacles: Sequence[tuple[str, str]] = (),
+    restarts: int = 200,
+    seed: int = 0,
+    all: bool = False,
+) -> Solution:
+    """Configuration of `model` that meets `goals`, always within joint limits, with a verdict.
+
+    Args:
+        model: constant; its active connect, weld and joint equalities that the goals touch hold, too.
+        goals: hard ones (no weight) are met exactly or judged; weighted ones as well as those allow. When all
+            have weights they are judged together and the answer is their compromise.
+        q0: where to start (nq,), and what "near" means; default the model's qpos0.
+        joints: names of the joints that may move; default all that the goals depend on.
+        prefer: what decides between answers: "near" q0, "middle" of the ranges, "manipulability", or "clear"
+            of `obstacles`.
+        obstacles: pairs of geoms for "clear".
+        restarts: random starts before giving up; `seed` makes them repeatable.
+        all: list distinct solutions.
+
+    Raises ModelError for goals or names that do not fit the model.
+    """
+    begin = time.perf_counter()
+    goals = (goals,) if isinstance(goals, Goal) else tuple(goals)
+    space = Space(model)
+    start = space.check(model.qpos0 if q0 is None else q0)
+    problem = Problem(model, goals, space, joints=joints)
+    judged, wished = _parts(problem)
+    prefers = preference(prefer, judged, start, obstacles)
+    wish: Wish = prefers if wished is None else Wishes(wished, prefers)
+    search = Search(judged, start, restarts=restarts, seed=seed)
+    found = search.solutions(candidates(judged, start), every=all)
+    if len(found):
+        best = _settled(judged, space, found, wish, start, every=all)
+        verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
+        return _solution(problem, best[0], verdict, best if all else best[:1], None, search, begin)
+    nearest = _nearest(judged, search.best)
+    if nearest.met[0]:  # a slow end, as at a singular boundary, got there after all
+        verdict = Verdict("solved", True, _solved_words(judged, nearest.q), restarts=search.used)
+        return _solution(problem, nearest.q[0], verdict, nearest.q, None, search, begin)
+    diagnosis = diagnose(judged, search, nearest)
+    if diagnosis.found is not None:
+        best = _settled(judged, space, diagnosis.found[None], wish, start, every=False)
+        verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
+        return _solution(problem, best[0], verdict, best, None, search, begin)
+    q = diagnosis.nearest
+    if wished is not None and any(g.weight is None for g in problem.goals):
+        q = nearest.q[0] if q is None else q
+    answer = nearest.q[0] if q is None else q
+    return _solution(
+        problem, answer, diagnosis.verdict, answer[:0].reshape(0, 0), diagnosis.q_free, search, begin
+    )
+
+
+def _parts(problem: Problem) -> tuple[Problem, Problem | None]:
+    """The judged goals as a problem, and the wishes beside them."""
+    hard = [g for g in problem.goals if g.weight is None]
+    soft = [g for g in problem.goals if g.weight is not None]
+    if not hard or not soft:
+        return problem, None
+    judged, wished = problem.only(hard), problem.only(soft)
+    judged.moved, wished.moved = problem.moved, problem.moved
+    wished.loops, judged.loops = [], problem.loops
+    judged._layout()
+    wished._layout()
+    return judged, wished
+
+
+def _settled(judged: Problem, space: Space, found: Array, wish: Wish, start: Array, *, every: bool) -> Array:
+    """Distinct solutions (k, nq) that serve the wish best, best first."""
+    found = space.nearest_turns(found, start)
+    value = np.array([np.sum(wish(q[None]).r ** 2) for q in found])
+    settled = []
+    for i in np.argsort(value, kind="stable")[: None if every else 3]:
+        end = settle(judged, found[i], wish)
+        settled.append((end.value, space.nearest_turns(end.q[None], start)[0]))
+    settled.sort(key=lambda pair: pair[0])
+    return distinct(space, np.array([q for _, q in settled]))
+
+
+def distinct(space: Space, q: Array, *, apart: float = 1e-3) -> Array:
+    """Rows of q (n, nq) that differ by more than `apart` in some freedom, whole turns not counted."""
+    kept: list[Array] = []
+    for x in q:
+        if kept:
+            d = space.difference(np.tile(x, (len(kept), 1)), np.array(kept))
+            d[:, space.hinges] -= 2 * np.pi * np.round(d[:, space.hinges] / (2 * np.pi))
+            if np.abs(d).max(axis=1).min() <= apart:
+                continue
+        kept.append(x)
+    return np.array(kept)
+
+
+def _nearest(judged: Problem, best: Descent) -> Descent:
+    """The best of the nearest poses found, sharpened."""
+    ends = [sharpen(judged, q) for q in best.q[:3]]
+    return min(ends, key=lambda end: float(end.cost[0]))
+
+
+def _solved_words(problem: Problem, q: Array) -> str:
+    r = problem.raw(q[:1]).r[0]
+    metres = problem.metres
+    parts = []
+    if (metres & problem.judged).any():
+        parts.append(f"{np.abs(r[metres & problem.judged]).max():.1e} m")
+    if (~metres & problem.judged).any():
+        parts.append(f"{np.abs(r[~metres & problem.judged]).max():.1e} rad")
+    return "largest residual " + ", ".join(parts) if parts else "nothing to meet"
+
+
+def residuals(problem: Problem, q: Array) -> tuple[Residual, ...]:
+    """Residuals of every goal and loop at q (nq,)."""
+    r = problem.raw(q[None]).r
+    out = []
+    for group in problem.groups:
+        part, tolerance = r[:, group.rows], problem.tolerance[group.rows]
+        if group.goal is not None:
+            position, rotation = group.goal.errors(part)
+        else:
+            metres = problem.metres[group.rows]
+            position, rotation = (np.linalg.norm(part[:, m], axis=1) for m in (metres, ~metres))
+        met = bool((np.abs(part[0]) <= tolerance).all())
+        out.append(Residual(group.label, float(position[0]), float(rotation[0]), met))
+    return tuple(out)
+
+
+def _solution(
+    problem: Problem,
+    q: Array,
+    verdict: Verdict,
+    solutions: Array,
+    free: Array | None,
+    search: Search,
+    begin: float,
+) -> Solution:
+    arrays = [np.array(q), np.array(solutions)] + ([] if free is None else [np.array(free)])
+    for array in arrays:
+        array.setflags(write=False)
+    seconds = time.perf_counter() - begin
+    verdict = replace(verdict, restarts=search.used)
+    return Solution(
+        arrays[0], residuals(problem, q), verdict, arrays[1], None if free is None else arrays[2],
+        search.iterations, search.used, seconds,
+    )  # fmt: skip

@@ -1,0 +1,83 @@
+"""What an answer is worth: the verdict, its proofs, and the results that carry it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Kind = Literal["solved", "out of reach", "held by limits", "conflict", "not found"]
+
+
+class Residual(NamedTuple):
+    """What is left of one goal or loop: metres, radians, and whether it is within its tolerance."""
+
+    goal: str
+    position: float
+    rotation: float
+    met: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether goals can be met, and if not, why.
+
+    Attributes:
+        kind: what was found.
+        proved: a bound or a closed form says so; otherwise only that `restarts` searches found nothing else.
+            An answer that meets its goals is its own proof.
+        reason: in words.
+        position, rotation: how far out of reach [m], [rad]; each with the other held where a pose's two parts
+            can be met only apart. Limits of joints count unless limits alone are the reason (then 0).
+        bound: proved least distance [m] (out of reach or conflict), 0 without one.
+        joints: joints whose limits hold the goals back, with how far beyond them [rad or m] a solution lies.
+        goals: goals that cannot be met (together).
+        restarts: searches that ended without meeting the goals.
+    """
+
+    kind: Kind
+    proved: bool
+    reason: str
+    position: float = 0.0
+    rotation: float = 0.0
+    bound: float = 0.0
+    joints: dict[str, float] | None = None
+    goals: tuple[str, ...] = ()
+    restarts: int = 0
+
+    def __str__(self) -> str:
+        if self.kind == "solved":
+            return f"solved: {self.reason}"
+        certainty = "proved" if self.proved else f"not proved: none found in {self.restarts} restarts"
+        return f"{self.kind}: {self.reason} ({certainty})"
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Answer to an inverse-kinematics question.
+
+    Attributes:
+        q (nq,): within limits always; the nearest pose found when the goals cannot be met.
+        residuals: of every goal and touched loop of the model.
+        verdict: see `Verdict`.
+        solutions (k, nq): distinct solutions (whole turns apart count as one), best first; only with `all`.
+        q_free (nq,): a solution that leaves the limits, when limits are the reason; otherwise None.
+        iterations: of damped least squares over all starts; restarts: random starts used; seconds: wall time.
+    """
+
+    q: Array
+    residuals: tuple[Residual, ...]
+    verdict: Verdict
+    solutions: Array
+    q_free: Array | None
+    iterations: int
+    restarts: int
+    seconds: float
+
+    @property
+    def solved(self) -> bool:
+        """Whether all that is judged is met."""
+        return self.verdict.kind == "solved"
