@@ -101,10 +101,11 @@ def _watch(
     names = [driver.label(i) for i in ids]
     position = np.full(len(ids), np.nan)
     while True:
+        done = request is None or person.ready(request)
         now = block.decode(driver.read_block(block))[:, 0]
         position = np.where(np.isnan(now), position, now)
         low, high = np.fmin(low, position), np.fmax(high, position)
-        if request is None or person.ready(request):
+        if done:
             if np.isnan(position).any():
                 id = ids[int(np.argmax(np.isnan(position)))]
                 raise HardwareError(f"{driver.label(id)} does not answer")

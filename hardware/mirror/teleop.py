@@ -15,7 +15,7 @@ from ..driver import Driver
 from ..mapping import joint_bounds, make_mapping
 from ..rig import Rig, RigError, Stop, load_rig
 from ..virtual import VirtualBus
-from .contract import RigFault, scan
+from .contract import FEEDBACK, RigFault, scan
 from .loop import PATIENCE, Log
 from .record import MirrorReport, make_report
 from .session import Outcome, Session
@@ -188,6 +188,7 @@ def _recording(rig: Rig, driver: Driver, t: Array, q: Array) -> Recording | None
     s = mapping.servo(q)
     speed = np.gradient(s, t, axis=0)
     log = Log(due=list(t), begun=list(t), ended=list(t), phase=["stream"] * len(t), goal=list(s))
-    log.feedback = [np.stack([a, b, np.zeros_like(a)], axis=1) for a, b in zip(s, speed, strict=True)]
+    rest = np.zeros((s.shape[1], len(FEEDBACK) - 2))
+    log.feedback = [np.column_stack([a, b, rest]) for a, b in zip(s, speed, strict=True)]
     outcome = Outcome(stop="limp: it never had torque", log=log)
     return make_report(outcome, rig, driver, mapping, model=rig.load_model()).recording
