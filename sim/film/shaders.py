@@ -180,7 +180,8 @@ void main() {{
     float mirrored = 0.02 + 0.2 * graze * graze * graze;
     vec3 around = mix(ambient_below, 3.0 * ambient_above, 0.5 + 0.5 * reflect(-v, m).z);
     vec3 light = albedo * (diffuse + surface.z) + surface.x * (0.3 * gloss * specular + mirrored * around);
-    light = light / (1.0 + max(light - 0.8, 0.0));  // a soft shoulder for what is brighter than white
+    // A soft shoulder for what is brighter than white; by the brightest channel, so that hues stay.
+    light /= 1.0 + max(max(light.r, max(light.g, light.b)) - 0.8, 0.0);
     vec3 shown = sqrt(light);
 {haze}
     frag_color = vec4(shown, alpha);

@@ -69,6 +69,7 @@ def theirs(stack: ExitStack, model: mujoco.MjModel, camera: Camera, *, lean: boo
     model.vis.quality.offsamples = samples
     data = mujoco.MjData(model)
     view = mujoco.MjvCamera()
+    model.vis.global_.fovy = np.degrees(camera.pose(0.0, data)[1])
     away = np.asarray(camera.position) - np.asarray(camera.target)
     view.lookat[:] = np.asarray(camera.target)
     view.distance = float(np.linalg.norm(away))
