@@ -27,7 +27,7 @@ Floats = NDArray[np.floating]
 BACKGROUND = ((0.80, 0.86, 0.92), (0.40, 0.56, 0.76), (0.62, 0.67, 0.73))  # at, above, below the horizon
 _AMBIENT = (np.array([0.20, 0.215, 0.24]), np.array([0.11, 0.105, 0.10]))  # linear, from above and below
 _SHADOW_SIZE = 1024
-_FULL = 1.25  # light that a model file's lamps give together
+_FULL = 1.15  # light that a model file's lamps give together
 _MOST_SHADOWS = 12  # texture units that every OpenGL 3.3 has, less those of the materials
 
 

@@ -181,7 +181,9 @@ void main() {{
     vec3 around = mix(ambient_below, 3.0 * ambient_above, 0.5 + 0.5 * reflect(-v, m).z);
     vec3 light = albedo * (diffuse + surface.z) + surface.x * (0.3 * gloss * specular + mirrored * around);
     // A soft shoulder for what is brighter than white; by the brightest channel, so that hues stay.
-    light /= 1.0 + max(max(light.r, max(light.g, light.b)) - 0.8, 0.0);
+    float peak = max(light.r, max(light.g, light.b));
+    float above = max(peak - 0.8, 0.0);
+    if (above > 0.0) light *= (0.8 + 0.2 * above / (above + 0.2)) / peak;
     vec3 shown = sqrt(light);
 {haze}
     frag_color = vec4(shown, alpha);
