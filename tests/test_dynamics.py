@@ -1,0 +1,627 @@
+"""The smooth engine against MuJoCo, closed laws, and exact derivatives."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from pantograph.sim.compile.jit import preferred_lanes
+from pantograph.sim.dynamics import LinearFeedback, compile_model, joint_pd, unsupported
+from pantograph.sim.dynamics.functions import FORMULATIONS, FUNCTIONS
+from pantograph.sim.dynamics.layout import Layout, keyed_joints
+from pantograph.sim.dynamics.symbolic import Equations
+from pantograph.sim.errors import EngineError
+from pantograph.sim.integrate import TABLEAUS, solve
+from strategies import random_states, seeds, trees
+
+MJCF = Path(__file__).parent.parent / "models" / "mjcf"
+OURS = sorted(MJCF.glob("*.xml"))
+FEATURES = """
+<mujoco><option timestep="0.001" {fluid}/><compiler angle="radian"/>
+<worldbody>
+ <body pos="0 0 1" gravcomp="0.4"><freejoint name="f"/><geom size=".1 .2 .3" type="box"/>
+  <body pos=".2 .1 .3" quat="1 .2 .3 .4">
+   <joint name="b" type="ball" stiffness="3" damping=".2" armature=".03"/>
+   <geom type="capsule" size=".05" fromto="0 0 0 .1 .2 .3"/>
+   <body pos=".1 .2 .3" euler=".3 .2 .1">
+    <joint name="h1" axis="1 2 3" pos=".01 .02 .03" stiffness="2 .5 .7" springref=".3" damping=".1 .2 .3"
+     armature=".02" actuatorfrcrange="-2 2"/>
+    <joint name="s1" type="slide" axis="0 1 1" stiffness="2" damping=".3 .1 .05" ref=".1"/>
+    <geom type="box" size=".05 .02 .1" pos="0 .1 0"/></body></body>
+  <body pos="-.1 .1 0" gravcomp="1"><joint name="h2" axis="0 1 0" ref=".5"/>
+   <geom type="box" size=".05 .02 .1" pos="0 .1 0"/>
+   <body><geom type="box" size=".03 .02 .1" pos="0.3 .1 0.1" euler=".1 .2 .3"/></body>
+  </body>
+ </body>
+ <body pos="1 0 0"><joint name="h3" axis="0 0 1"/><geom size=".1" pos=".1 0 0"/>
+  <body pos=".5 0 0" euler="0.0000001 0 0"><joint name="h4" axis="0 0 1"/><geom size=".1" pos=".1 0 0"/>
+   <body pos=".5 .1 0.2"><joint name="h5" axis="0 1 0"/><geom size=".05" pos=".1 0 0"/></body></body></body>
+</worldbody>
+<tendon><fixed name="t" stiffness="4 1 2" damping=".3 .1 .2" springlength=".1 .3">
+ <joint joint="h1" coef=".5"/><joint joint="h2" coef="-1.5"/></fixed></tendon>
+<actuator><motor joint="h1" gear="3" ctrllimited="true" ctrlrange="-.5 .6"/>
+ <position joint="h2" kp="20" kv="2" forcerange="-3 3"/><velocity joint="s1" kv="4"/>
+ <general tendon="t" gear="2" gaintype="affine" gainprm="1 .3 .2" biastype="affine" biasprm=".2 .3 .4"/>
+ <general joint="h3" dyntype="filter" dynprm=".2" gainprm="2"/>
+ <general joint="h4" dyntype="integrator" gainprm="2"/><motor joint="f" gear="1 2 3 4 5 6"/>
+ <position joint="b" kp="3" kv=".1" gear=".5 .2 .3"/>
+ <general joint="h5" dyntype="filterexact" dynprm=".2" gainprm="2"/></actuator>
+</mujoco>"""
+SWING = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
+ <body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".5 0 0" mass="1"/>
+  <body pos="1 0 0"><joint name="b" axis="0 1 0" damping=".1"/><geom size=".1" pos=".5 0 0" mass="2"/></body>
+ </body>
+ </worldbody><actuator><motor joint="a" gear="2"/><motor joint="b"/></actuator></mujoco>"""
+TOP = """<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom type="box" size=".1 .2 .3" mass="2"/>
+ <body pos=".3 .1 0"><joint name="b" type="ball"/>
+  <geom type="box" size=".05 .2 .1" pos=".1 0 .2" mass="1"/></body>
+ </body></worldbody></mujoco>"""
+
+
+def unconstrained(model):
+    model.opt.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )
+    return model
+
+
+def of_text(xml):
+    return unconstrained(mujoco.MjModel.from_xml_string(xml))
+
+
+def dressed(model, seed):
+    """The model with random springs, dampers and armature."""
+    rng = np.random.default_rng(seed)
+    scalar = np.isin(model.jnt_type, [2, 3])
+    model.dof_damping[:] = rng.uniform(0, 0.5, model.nv)
+    for joint in range(model.njnt):
+        model.dof_armature[model.dof_jntid == joint] = rng.choice([0.0, 0.3])
+    model.jnt_stiffness[scalar] = rng.uniform(0, 3, scalar.sum())
+    model.qpos_spring[:] = model.qpos0 + 0.0
+    return unconstrained(model)
+
+
+def forwarded(model, q, v, act=(), u=()):
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = q, v, act, u
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def value(eq, name, kind="composite", **given):
+    """Function `name` of the equations by NumPy, without a compiler; what is not given is zero."""
+    tape = FUNCTIONS[name](eq, kind)
+    out = tape.evaluate(*(np.asarray(given.get(k, np.zeros(n))) for k, n in tape.inputs.items()))
+    return dict(zip(tape.outputs, out, strict=True))
+
+
+def equations(model, keyed=(), **options):
+    return Equations(model, Layout(model, keyed_joints(model, keyed)), **options)
+
+
+def close(got, expected, tolerance=1e-10):
+    scale = max(np.abs(expected).max(initial=0.0), 1e-3)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * scale)
+
+
+def states_of(model, seed, n):
+    rng = np.random.default_rng(seed)
+    q, v, _ = random_states(model, seed, n)
+    return q, v, rng.normal(size=(n, model.na)), rng.normal(size=(n, model.nu))
+
+
+# ---- agreement with MuJoCo
+
+
+@settings(max_examples=60)
+@given(trees(), seeds)
+def test_any_tree_moves_as_in_mujoco(model, seed):
+    model = dressed(model, seed)
+    if not model.nv:
+        return
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    eq = equations(model)
+    q, v, a = (x[0] for x in random_states(model, seed, 1))
+    data = forwarded(model, q, v)
+    for kind in FORMULATIONS:
+        close(value(eq, "forward", kind, q=q, v=v)["a"], data.qacc)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    close(value(eq, "mass_matrix", q=q)["M"], M.ravel())
+    close(value(eq, "bias", q=q, v=v)["bias"], data.qfrc_bias)
+    poses = value(eq, "poses", q=q)
+    close(poses["p"], data.xpos.ravel())
+    close(poses["R"], data.xmat.ravel())
+    close(value(eq, "sites", q=q)["p"], data.site_xpos.ravel())
+    energy = value(eq, "energy", q=q, v=v)
+    close(energy["kinetic"], data.energy[1:])
+    close(energy["potential"], data.energy[:1])
+    data.qacc[:] = a
+    mujoco.mj_inverse(model, data)
+    close(value(eq, "inverse", q=q, v=v, a=a)["tau"], data.qfrc_inverse)
+
+
+@pytest.mark.parametrize("fluid", ["", 'wind="0.3 -.2 .1" density="1.2" viscosity="0.3"'])
+def test_every_feature_acts_as_in_mujoco(fluid):
+    model = of_text(FEATURES.format(fluid=fluid))
+    smooth = compile_model(model, cache=None)
+    q, v, act, u = states_of(model, 3, 50)
+    got, rates = smooth.forward(q, v, u, act=act), smooth.evaluate("rate", q=q, v=v, act=act, u=u)["dx"]
+    for i in range(len(q)):
+        data = forwarded(model, q[i], v[i], act[i], u[i])
+        close(got[i], data.qacc)
+        close(rates[i, model.nq + model.nv :], data.act_dot)
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
+def test_our_models_agree_over_the_whole_state_space(path):
+    model = unconstrained(mujoco.MjModel.from_xml_path(str(path)))
+    if missing := unsupported(model):
+        pytest.skip(f"the smooth engine does not do {path.stem}: {missing[0]}")
+    eq = equations(model)
+    q, v, act, u = states_of(model, 1, 40)
+    n = len(q)
+    shared = {"tau": np.zeros((n, model.nv)), "w": np.zeros((n, 0)), "p": np.zeros((n, 0))}
+    got = value(eq, "forward", "articulated", q=q, v=v, act=act, u=u, **shared)["a"]
+    for i in range(n):
+        close(got[i], forwarded(model, q[i], v[i], act[i], u[i]).qacc)
+
+
+def test_nearly_parallel_axes_and_dust_beside_boulders_cost_no_accuracy():
+    xml = """<mujoco><compiler angle="radian"/><worldbody><body>
+      <joint axis="0 0 1"/><geom type="box" size="2 2 2" mass="1000"/>
+      <body pos="1 0 .5" euler="{tilt} 0 0"><joint axis="0 0 1"/><geom type="box" size=".3 .2 .1" mass="1"/>
+      <body pos="1 0 0" euler="1.5708 0 0"><joint axis="0 0 1"/>
+      <inertial pos=".001 .002 0" mass="1e-5" diaginertia="1e-12 2e-12 2.5e-12"/></body></body></body>
+      </worldbody></mujoco>"""
+    for tilt in (1e-15, 1e-12, 1e-9, 1e-6, 1e-3):
+        model = of_text(xml.format(tilt=tilt))
+        eq = equations(model)
+        q, v, _, _ = states_of(model, 0, 5)
+        for i in range(5):
+            data = forwarded(model, q[i], v[i])
+            for kind in FORMULATIONS:
+                close(value(eq, "forward", kind, q=q[i], v=v[i])["a"], data.qacc, 1e-9)
+
+
+# ---- roles
+
+
+@settings(max_examples=30)
+@given(trees(), seeds)
+def test_keyed_joints_act_by_their_prescribed_motion(model, seed):
+    model = dressed(model, seed)
+    rng = np.random.default_rng(seed)
+    keyed = [j for j in range(model.njnt) if rng.random() < 0.5]
+    eq = equations(model, keyed)
+    lay = eq.layout
+    if not lay.nv:
+        return
+    q, v, a = (x[0] for x in random_states(model, seed, 1))
+    data = forwarded(model, q, v)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
+    free, held = lay.v_free, lay.v_keyed
+    expected = np.linalg.solve(M[np.ix_(free, free)], force[free] - M[np.ix_(free, held)] @ a[held])
+    drive = M[np.ix_(held, free)] @ expected + M[np.ix_(held, held)] @ a[held] - force[held]
+    given_ = {"q": q[lay.q_free], "v": v[free], "w": np.concatenate([q[lay.q_keyed], v[held], a[held]])}
+    for kind in FORMULATIONS:
+        close(value(eq, "forward", kind, **given_)["a"], expected, 1e-9)
+    close(value(eq, "drive", **given_)["drive"], drive, 1e-9)
+
+
+def test_a_keyed_pendulum_carries_the_other_one():
+    model = of_text(SWING)
+    smooth = compile_model(model, keyed=["a"], cache=None)
+
+    def motion(t):
+        return np.stack([0.3 * np.sin(5 * t), 1.5 * np.cos(5 * t), -7.5 * np.sin(5 * t)], axis=1)
+
+    path = smooth.rollout([0.2], [0.0], step=1e-3, steps=500, w=motion)
+    finer = smooth.rollout([0.2], [0.0], step=2.5e-4, steps=2000, every=4, w=motion)
+    assert np.abs(path.q - finer.q).max() < 1e-10
+    by_solve = solve(
+        smooth.problem(w=motion), (0.0, 0.5), [0.2, 0.0], method="dop853", rtol=1e-12, atol=1e-12
+    )
+    close(path.x[-1], by_solve.y[-1], 1e-10)
+    with pytest.raises(EngineError, match="prescribed motion"):
+        smooth.forward([0.2], [0.0])
+
+
+@pytest.mark.parametrize("keyed", [["a"], [0], np.array([True, False])])
+def test_keyed_joints_have_names_numbers_or_a_mask(keyed):
+    assert keyed_joints(of_text(SWING), keyed) == (0,)
+
+
+def test_keyed_joints_that_do_not_exist_or_are_cut_in_two_are_refused():
+    model = of_text(TOP)
+    with pytest.raises(EngineError, match="no joint 'elbow'"):
+        keyed_joints(model, ["elbow"])
+    with pytest.raises(EngineError, match="keyed in part"):
+        keyed_joints(model, np.arange(model.nv) == 7)
+    with pytest.raises(EngineError, match=r"shape \(3,\)"):
+        keyed_joints(model, np.array([True, False, True]))
+
+
+# ---- derivatives
+
+
+@settings(max_examples=20)
+@given(trees(max_bodies=3), seeds)
+def test_derivatives_equal_the_complex_step(model, seed):
+    model = dressed(model, seed)
+    if not model.nv:
+        return
+    eq = equations(model)
+    q, v, bar = (x[0] for x in random_states(model, seed, 1))
+    forward = FUNCTIONS["forward"](eq, "articulated")
+    base = {"q": q, "v": v, "tau": np.linspace(-1, 1, model.nv)}
+    h = 1e-40
+
+    def step(name, direction):
+        changed = {k: np.asarray(base.get(k, np.zeros(n)), complex) for k, n in forward.inputs.items()}
+        changed[name] = changed[name] + 1j * h * direction
+        return forward.evaluate(*changed.values())[0].imag / h
+
+    exact = {}
+    directions = [_tangent(model, q, k) for k in range(model.nv)]
+    exact["q"] = np.stack([step("q", d) for d in directions], axis=1)
+    for name in ("v", "tau"):
+        exact[name] = np.stack([step(name, d) for d in np.eye(model.nv)], axis=1)
+    got = value(eq, "derivatives", **base)
+    for name, J in exact.items():
+        close(got["d" + name], J.ravel(), 1e-9)
+    wide = np.concatenate([bar, np.zeros(len(eq.inputs["bar"]) - model.nv)])
+    back = value(eq, "vjp", bar=wide, **base)
+    for name, J in exact.items():
+        close(back[name], bar @ J, 1e-9)
+
+
+def _tangent(model, q, k):
+    """d qpos along freedom k; a body's angular velocity w turns its quaternion by q (0, w) / 2."""
+    joint = model.dof_jntid[k]
+    at, dof, kind = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_type[joint]
+    out = np.zeros(model.nq)
+    place = k - dof
+    if (kind == 0 and place < 3) or kind in (2, 3):
+        out[at + place] = 1.0
+        return out
+    at, place = (at + 3, place - 3) if kind == 0 else (at, place)
+    mujoco.mju_mulQuat(out[at : at + 4], q[at : at + 4], np.concatenate([[0.0], 0.5 * np.eye(3)[place]]))
+    return out
+
+
+def test_parameters_are_inputs_with_derivatives():
+    model = of_text(FEATURES.format(fluid=""))
+    names = [("body_mass", 2), ("body_pos", 3, 1), ("actuator_gainprm", 1), ("dof_damping", "h3")]
+    names += [("body_ipos", 3, 2), ("jnt_stiffness", "b"), ("dof_armature", "h1"), ("body_inertia", 6, 0)]
+    names += [("body_pos", 7, 0), ("actuator_gear", 3), ("tendon_damping", "t"), ("qpos_spring", "h1")]
+    eq = equations(model, parameters=names)
+    smooth = compile_model(model, parameters=names, cache=None)
+    q, v, act, u = (x[0] for x in states_of(model, 5, 1))
+    given_ = {"q": q, "v": v, "act": act, "u": u}
+    p = smooth.parameter_values * 1.1 + 0.01
+    changed = of_text(FEATURES.format(fluid=""))
+    changed.body_mass[2], changed.body_pos[3, 1], changed.actuator_gainprm[1, 0] = p[:3]
+    changed.dof_damping[changed.joint("h3").dofadr] = p[3]
+    changed.body_ipos[3, 2] = p[4]
+    changed.jnt_stiffness[changed.joint("b").id] = p[5]
+    changed.dof_armature[changed.joint("h1").dofadr] = p[6]
+    changed.body_inertia[6, 0], changed.body_pos[7, 0], changed.actuator_gear[3, 0] = p[7:10]
+    changed.tendon_damping[0] = p[10]
+    changed.qpos_spring[changed.joint("h1").qposadr] = p[11]
+    close(value(eq, "forward", p=p, **given_)["a"], forwarded(changed, q, v, act, u).qacc)
+    got = value(eq, "control_derivatives", p=p, **given_)
+    h = 1e-5
+    for name, size in (("p", len(names)), ("u", model.nu), ("act", model.na)):
+        J = got["d" + name].reshape(model.nv, size)
+        for k in range(size):
+            ends = []
+            for sign in (1, -1):
+                moved = given_ | {"p": p}
+                moved[name] = moved[name] + sign * h * (np.arange(size) == k)
+                ends.append(value(eq, "forward", **moved)["a"])
+            close(J[:, k], (ends[0] - ends[1]) / (2 * h), 1e-6)
+
+
+def test_parameters_that_cannot_be_are_refused_by_name():
+    model = of_text(SWING)
+    with pytest.raises(EngineError, match="no parameter field 'body_quat'"):
+        compile_model(model, parameters=[("body_quat", 1)])
+    with pytest.raises(EngineError, match=r"no joint 'c'.*has: a, b"):
+        compile_model(model, parameters=[("dof_damping", "c")])
+    with pytest.raises(EngineError, match="outside body_pos"):
+        compile_model(model, parameters=[("body_pos", 1, 3)])
+
+
+@pytest.mark.parametrize("xml", [SWING, TOP])
+def test_derivatives_of_a_step_equal_the_step_s_differences(xml):
+    model = of_text(xml)
+    smooth = compile_model(model, parameters=[("body_mass", 2)], cache=None)
+    q, v, _, u = (x[0] for x in states_of(model, 2, 1))
+    got = smooth.step_derivatives(q, v, u, step=0.01)
+    after = smooth.rollout(q, v, u, step=0.01, steps=1)
+    close(got.x, after.x[-1], 1e-14)
+    nv, h = model.nv, 1e-5
+
+    def moved(dq=None, dv=0.0, du=0.0, dp=0.0):
+        start = q.copy()
+        mujoco.mj_integratePos(model, start, np.zeros(nv) if dq is None else dq, 1.0)
+        p = smooth.parameter_values + dp
+        end = smooth.rollout(start, v + dv, u + du, step=0.01, steps=1, p=p).x[-1]
+        out = np.zeros(2 * nv)
+        mujoco.mj_differentiatePos(
+            model, out[:nv], 1.0, got.x[: model.nq], np.ascontiguousarray(end[: model.nq])
+        )
+        out[nv:] = end[model.nq :] - got.x[model.nq :]
+        return out
+
+    def column(**direction):
+        minus = {k: -x for k, x in direction.items()}
+        return (moved(**direction) - moved(**minus)) / (2 * h)
+
+    A = np.stack([column(dq=h * e) for e in np.eye(nv)] + [column(dv=h * e) for e in np.eye(nv)], axis=1)
+    close(got.A, A, 1e-7)
+    for k in range(model.nu):
+        close(got.B[:, k], column(du=h * (np.arange(model.nu) == k)), 1e-7)
+    close(got.P[:, 0], column(dp=np.array([h])), 1e-7)
+
+
+def test_the_adjoint_of_the_rate_is_the_transpose_of_its_jacobian():
+    model = of_text(TOP)
+    smooth = compile_model(model, parameters=[("body_mass", 2), ("body_pos", 2, 0)], cache=None)
+    q, v, _, _ = states_of(model, 4, 3)
+    bar = np.random.default_rng(0).normal(size=(3, smooth.layout.nx))
+    J = smooth.evaluate("rate_jacobian", q=q, v=v)
+    back = smooth.evaluate("rate_vjp", q=q, v=v, bar=bar)
+    n = smooth.layout.nx
+    close(back["x"], np.einsum("bi,bij->bj", bar, J["dx"].reshape(3, n, n)))
+    close(back["p"], np.einsum("bi,bij->bj", bar, J["dp"].reshape(3, n, 2)))
+
+
+# ---- conservation and order
+
+
+def test_a_floating_top_keeps_energy_and_momentum():
+    model = of_text(TOP)
+    model.opt.gravity[:] = 0
+    smooth = compile_model(model, cache=None)
+    q, v, _, _ = states_of(model, 1, 3)
+    path = smooth.rollout(q, v, step=1e-3, steps=2000, every=100, method=TABLEAUS["dop853"])
+    for b in range(3):
+        kinetic, _ = smooth.energy(path.q[b], path.v[b])
+        linear, angular = smooth.momentum(path.q[b], path.v[b])
+        assert np.ptp(kinetic) < 1e-11 * kinetic[0]
+        assert np.ptp(linear, axis=0).max() < 1e-11
+        assert np.ptp(angular, axis=0).max() < 1e-11
+
+
+def test_a_swinging_chain_keeps_its_energy():
+    model = of_text(SWING.replace('damping=".1"', 'stiffness="3" armature=".1"'))
+    smooth = compile_model(model, cache=None)
+    path = smooth.integrate(
+        [2.0, 0.5], [0.0, 1.0], np.linspace(0, 5, 51), method=TABLEAUS["verner98"], rtol=1e-12, atol=1e-12
+    )
+    assert path.success
+    assert np.ptp(sum(smooth.energy(path.q, path.v))) < 1e-9
+
+
+@pytest.mark.parametrize("method", [*TABLEAUS])
+@pytest.mark.parametrize("xml", [SWING, TOP], ids=["hinges", "quaternions"])
+def test_compiled_steps_have_the_method_s_order(method, xml, engines):
+    smooth, q, v, span, exact = engines[xml]
+    tableau = TABLEAUS[method]
+    counts = {5: (32, 64), 8: (8, 16), 9: (8, 16)}.get(tableau.order, (128, 256))
+    errors = []
+    for n in counts:
+        path = smooth.rollout(q, v, step=span / n, steps=n, every=n, method=tableau)
+        errors.append(np.abs(path.x[-1] - exact).max())
+    order = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
+    assert order > tableau.order - 0.3, f"errors {errors}"
+    assert errors[0] > 1e-13
+
+
+@pytest.fixture(scope="module")
+def engines():
+    out = {}
+    for xml in (SWING, TOP):
+        model = of_text(xml)
+        smooth = compile_model(model, cache=None)
+        q, v = (x[0] for x in states_of(model, 7, 1)[:2])
+        q, v = (np.array([0.5, 0.3]), np.array([1.0, -0.5])) if xml == SWING else (q, 2 * v)
+        span = 0.2 if xml == SWING else 0.6
+        path = smooth.rollout(q, v, step=span / 400, steps=400, every=400, method=TABLEAUS["verner98"])
+        out[xml] = smooth, q, v, span, path.x[-1]
+    return out
+
+
+# ---- rollouts
+
+
+def test_fixed_steps_equal_mujoco_s():
+    from mujoco.rollout import rollout
+
+    # MuJoCo integrates "filterexact" by its exact solution, Runge-Kutta methods by their own
+    model = of_text(FEATURES.format(fluid="").replace("filterexact", "filter"))
+    model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
+    smooth = compile_model(model, cache=None)
+    _, v, act, u = states_of(model, 9, 5)
+    q = np.tile(model.qpos0, (5, 1))
+    for row, direction in zip(q, v, strict=True):
+        mujoco.mj_integratePos(model, row, direction, 0.1)
+    state = np.concatenate([np.zeros((5, 1)), q, v, act], axis=1)
+    reference, _ = rollout(model, mujoco.MjData(model), state, np.repeat(u[:, None], 40, axis=1))
+    path = smooth.rollout(q, v, u[:, None], act0=act, step=model.opt.timestep, steps=40, hold=40)
+    np.testing.assert_allclose(path.x[:, 1:], reference[:, :, 1:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 7, 19])
+def test_one_state_any_lanes_and_any_threads_give_one_motion(n):
+    model = of_text(TOP)
+    q, v, _, _ = states_of(model, 3, n)
+    single = compile_model(model, cache=None)
+    alone = np.stack([single.rollout(q[i], v[i], step=1e-3, steps=30).x for i in range(n)])
+    for lanes in {1, 2, 4, 8, preferred_lanes()}:
+        batch = compile_model(model, lanes=lanes, cache=None).rollout(q, v, step=1e-3, steps=30)
+        np.testing.assert_allclose(batch.x, alone, rtol=0, atol=2e-14)
+
+
+def test_controls_are_held_over_their_period_however_they_are_given():
+    model = of_text(SWING)
+    smooth = compile_model(model, cache=None)
+    K = joint_pd(model, 5.0, 0.5)
+    np.testing.assert_allclose(K, [[2.5, 0, 0.25, 0], [0, 5, 0, 0.5]])
+    q_ref = np.linspace([0.0, 0.0], [1.0, -1.0], 10)
+    law = LinearFeedback(K, q_ref=q_ref, u_ref=[0.1, 0.2])
+    q, v = np.array([0.3, -0.2]), np.array([0.5, 0.1])
+    compiled = smooth.rollout(q, v, law, step=1e-3, steps=100, hold=10)
+    period = iter(q_ref)
+
+    def python(t, q, v):
+        return np.array([0.1, 0.2]) + K @ np.concatenate([next(period) - q, -v])
+
+    called = smooth.rollout(q, v, python, step=1e-3, steps=100, hold=10)
+    np.testing.assert_allclose(compiled.x, called.x, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(compiled.u, called.u, rtol=0, atol=1e-12)
+    replayed = smooth.rollout(q, v, compiled.u, step=1e-3, steps=100, hold=10)
+    np.testing.assert_allclose(replayed.x, compiled.x, rtol=0, atol=1e-13)
+    adaptive = smooth.integrate(
+        q, v, compiled.t[::10], law, hold=0.01, method=TABLEAUS["dop853"], rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(adaptive.x, compiled.x[::10], rtol=0, atol=1e-9)
+
+
+def test_feedback_takes_differences_of_rotations_on_the_manifold():
+    xml = TOP.replace("</worldbody>", "</worldbody><actuator><motor joint='b' gear='1 0 0'/></actuator>")
+    model = of_text(xml)
+    smooth = compile_model(model, cache=None)
+    (q, goal), (v, _), _, _ = states_of(model, 6, 2)
+    K = np.random.default_rng(0).normal(size=(1, 2 * model.nv))
+    path = smooth.rollout(q, v, LinearFeedback(K, q_ref=goal), step=1e-3, steps=1)
+    error = np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, error, 1.0, q, goal)
+    close(path.u[0], K @ np.concatenate([error, -v]))
+
+
+def test_gains_change_without_another_compilation():
+    model = of_text(SWING)
+    smooth = compile_model(model, cache=None)
+    for kp in (1.0, 50.0):
+        smooth.rollout([0.3, 0.1], [0.0, 0.0], LinearFeedback(joint_pd(model, kp, 1.0)), step=1e-3, steps=10)
+    assert len([b for b in smooth.stats.builds if b.name.startswith("fixed")]) == 1
+
+
+@pytest.mark.parametrize("method", [name for name, t in TABLEAUS.items() if t.adaptive])
+def test_tighter_tolerances_give_smaller_errors_at_every_requested_time(method, engines):
+    smooth, q, v, _, _ = engines[TOP]
+    times = np.linspace(0.0, 0.4, 24)
+    exact = smooth.rollout(q, v, step=0.4 / 23 / 20, steps=460, every=20, method=TABLEAUS["verner98"]).x
+    batch = smooth.integrate(
+        np.tile(q, (3, 1)), np.tile(v, (3, 1)), times, method=TABLEAUS[method], rtol=1e-7, atol=1e-7
+    )
+    for tolerance, bound in ((1e-4, 2e-2), (1e-7, 2e-5)):
+        path = smooth.integrate(q, v, times, method=TABLEAUS[method], rtol=tolerance, atol=tolerance)
+        assert path.success
+        assert np.abs(path.x - exact).max() < bound
+    np.testing.assert_allclose(batch.x[1], path.x, rtol=0, atol=1e-8)
+    assert batch.evaluations[0] == pytest.approx(path.evaluations, rel=0.05)
+
+
+def test_a_motion_that_cannot_go_on_says_so():
+    model = of_text(SWING)
+    smooth = compile_model(model, cache=None)
+    path = smooth.rollout([[0.3, 0.1], [0.2, np.inf]], [0.0, 0.0], step=1e-3, steps=5)
+    assert path.status.tolist() == [0, 3]
+    assert not path.success
+    few = smooth.integrate([0.3, 0.1], [0.0, 0.0], [0.0, 5.0], rtol=1e-10, atol=1e-10, max_steps=10)
+    assert few.status == 1
+    assert np.isnan(few.x[-1]).all()
+
+
+def test_shapes_that_do_not_fit_are_named():
+    smooth = compile_model(of_text(SWING), cache=None)
+    with pytest.raises(EngineError, match=r"q has shape \(3,\); expected \(2,\)"):
+        smooth.forward(np.zeros(3), np.zeros(2))
+    with pytest.raises(EngineError, match="different lengths"):
+        smooth.forward(np.zeros((3, 2)), np.zeros((2, 2)))
+    with pytest.raises(EngineError, match="must divide"):
+        smooth.rollout(np.zeros(2), np.zeros(2), step=1e-3, steps=10, every=3)
+    with pytest.raises(EngineError, match="controls has shape"):
+        smooth.rollout(np.zeros(2), np.zeros(2), np.zeros((4, 2)), step=1e-3, steps=10)
+    with pytest.raises(EngineError, match="does not estimate its error"):
+        smooth.integrate(np.zeros(2), np.zeros(2), [0.0, 1.0], method=TABLEAUS["rk4"])
+
+
+# ---- what it cannot do, what it does otherwise, what it keeps
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("</worldbody>", "</worldbody><equality><joint joint1='a' joint2='b'/></equality>"), "closed loops"),
+        (('<motor joint="b"/>', "<muscle joint='b' lengthrange='0 1'/>"), "muscle"),
+        (('<motor joint="b"/>', "<motor site='s'/>"), "transmission site"),
+        (('<motor joint="b"/>', "<position joint='b' kp='1' delay='0.1' nsample='10'/>"), "delay"),
+        (('<motor joint="b"/>', "<intvelocity joint='b' kp='1' actrange='-1 1'/>"), "actlimited"),
+        (
+            (
+                "</worldbody>",
+                "<site name='w'/></worldbody><tendon><spatial><site site='w'/><site site='s'/></spatial>"
+                "</tendon>",
+            ),
+            "through sites",
+        ),
+    ],
+)
+def test_what_it_cannot_do_is_named(change, named):
+    xml = SWING.replace(
+        '<geom size=".1" pos=".5 0 0" mass="2"/>', "<geom size='.1' mass='2'/><site name='s'/>"
+    )
+    model = mujoco.MjModel.from_xml_string(xml.replace(*change))
+    problems = unsupported(model)
+    assert any(named in line for line in problems), problems
+    with pytest.raises(EngineError, match=named):
+        compile_model(model)
+
+
+def test_dry_friction_is_smoothed_over_the_stated_width():
+    xml = SWING.replace('name="a"', 'name="a" frictionloss="3" range="-1 1" limited="true"')
+    model = mujoco.MjModel.from_xml_string(xml)
+    smooth = compile_model(model, friction_width=0.1, cache=None)
+    q, v = np.array([0.4, 0.2]), np.array([0.05, -0.3])
+    force = 3 * v[0] / np.hypot(v[0], 0.1)
+    expected = compile_model(model, cache=None).forward(q, v, tau=[-force, 0.0])
+    close(smooth.forward(q, v), expected, 1e-13)
+    assert [line for line in smooth.differences if "limits" in line and "event" in line]
+    assert [line for line in smooth.differences if "0.1 rad/s" in line]
+    with pytest.raises(EngineError, match="positive"):
+        compile_model(model, friction_width=0.0)
+
+
+def test_a_second_use_finds_the_code_and_another_model_does_not(tmp_path):
+    model = of_text(SWING)
+    q, v = np.array([0.4, 0.2]), np.array([0.5, -0.3])
+    first = compile_model(model, cache=tmp_path)
+    expected = first.forward(q, v)
+    assert not first.stats.cached
+    second = compile_model(model, cache=tmp_path)
+    np.testing.assert_array_equal(second.forward(q, v), expected)
+    assert second.stats.cached
+    assert "equations" not in vars(second)
+    model.body_mass[2] *= 2
+    third = compile_model(model, cache=tmp_path)
+    assert np.abs(third.forward(q, v) - expected).max() > 1e-3
+    assert not third.stats.cached
+    fourth = compile_model(model, cache=tmp_path, friction_width=0.1)
+    fourth.forward(q, v)
+    assert not fourth.stats.cached
+
+
+def test_a_bound_function_runs_on_its_own_arrays():
+    smooth = compile_model(of_text(SWING), cache=None)
+    bound = smooth.bind("forward")
+    bound.inputs["q"][:], bound.inputs["v"][:] = (0.4, 0.2), (0.5, -0.3)
+    bound()
+    np.testing.assert_array_equal(bound.outputs["a"], smooth.forward([0.4, 0.2], [0.5, -0.3]))
