@@ -14,11 +14,13 @@ from .goals import (
     Position,
     Posture,
 )
+from .raced import ChainSolver
 from .solve import solve
 from .verdict import Residual, Solution, Verdict
 
 __all__ = [
     "CenterOfMass",
+    "ChainSolver",
     "Distance",
     "Goal",
     "JointValue",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .. import rotations
 from ..kinds import BALL, HINGE
 from ..kinematics import Frame
-from .axes import Axis, linear_trig, meeting_point, point_by_three, three_turns
+from .axes import Axis, around, linear_trig, meeting_point, point_by_three, three_turns, turn_matrix
 from .goals import Pose, Position
 from .problem import Problem
 
@@ -74,13 +74,13 @@ def candidates(problem: Problem, start: Array) -> Array:
 
 def _chain(f: Frame, problem: Problem, start: Array) -> _Chain | None:
     """Axes of the joints that move; None for joints other than hinges and balls."""
-    from .reach import _standing
+    from .reach import standing
 
     joints, axes, T = [], [], np.eye(4)
     for joint in f.joints:
         T = T @ joint.X
         if not problem.moved[joint.v]:
-            T = T @ _standing(joint, start)
+            T = T @ standing(joint, start)
             continue
         if int(joint.type) not in (HINGE, BALL):
             return None
@@ -137,7 +137,7 @@ def _planar_point(axes: list[Axis], tip: Array, target: Array) -> _Found | None:
     flat = target - one.o - (one.u @ (target - one.o)) * one.u
     if len(axes) == 1:
         arm = tip - one.o
-        angle = _turn(one.u, arm, flat)
+        angle = around(one.u, arm, flat)
         return ([[angle]], True, name) if angle is not None else ([[0.0]], False, name)
     two = axes[1]
     a = two.o - one.o
@@ -148,16 +148,10 @@ def _planar_point(axes: list[Axis], tip: Array, target: Array) -> _Found | None:
     out, complete = [], roots.complete
     for th2 in roots.angles:
         arm = two.turn(th2, tip) - one.o
-        th1 = _turn(one.u, arm, flat)
+        th1 = around(one.u, arm, flat)
         complete = complete and th1 is not None
         out.append([th1 or 0.0, th2])
     return out, complete, name
-
-
-def _turn(u: Array, a: Array, b: Array) -> float | None:
-    from .axes import around
-
-    return around(u, a, b)
 
 
 def _wrist(axes: list[Axis], G: Array, w: Array) -> _Found:
@@ -167,7 +161,7 @@ def _wrist(axes: list[Axis], G: Array, w: Array) -> _Found:
     for angles in placed.angles:
         R = G[:3, :3]
         for axis, angle in zip(axes[:3], angles, strict=True):
-            R = rotations.to_matrix(rotations.exp(-angle * axis.u)) @ R
+            R = turn_matrix(axis.u, -angle) @ R
         turns = three_turns(axes[3:], R)
         complete = complete and turns.complete
         out += [[*angles, *rest] for rest in turns.angles]

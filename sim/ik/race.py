@@ -154,7 +154,13 @@ class Racer:
     call: Any
 
     def __call__(
-        self, seeds: ArrayLike, R: ArrayLike, p: ArrayLike, *, tolerance: tuple[float, float], most: int = 4000
+        self,
+        seeds: ArrayLike,
+        R: ArrayLike,
+        p: ArrayLike,
+        *,
+        tolerance: tuple[float, float],
+        most: int = 4000,
     ) -> Raced:
         """Configurations (k, n) for targets R (k, 3, 3), p (k, 3), from `seeds` (k, n).
 

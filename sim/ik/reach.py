@@ -147,7 +147,7 @@ def _hops(
         T = T @ joint.X
         kind = int(joint.type)
         if not moved[joint.v]:
-            T = T @ _standing(joint, q)
+            T = T @ standing(joint, q)
         elif kind == FREE:
             return None
         elif kind == SLIDE:
@@ -163,7 +163,7 @@ def _hops(
     return hops[0], hops[1:], kinds
 
 
-def _standing(joint, q: Array) -> Array:  # type: ignore[no-untyped-def]
+def standing(joint, q: Array) -> Array:  # type: ignore[no-untyped-def]
     """Pose (4, 4) across a joint that stands at q (nq,)."""
     X = np.eye(4)
     kind = int(joint.type)

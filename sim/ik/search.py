@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from .descend import Descent, descend
 from .problem import Problem
+from .raced import racer_of
 
 Array = NDArray[np.float64]
 _BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found
+_MOST = 10_000  # iterations of a compiled search, each in all lanes: some thousand starts
 
 
 class Search:
@@ -38,12 +40,15 @@ class Search:
         restarts are used.
         """
         space, moved = self.problem.space, self.problem.moved
-        found = []
-        if len(first):
-            found.append(self._attempt(space.clip(first), first=False))
-        starts = np.stack([self.start, space.middle(self.start, moved)])
-        if not len(first) or every or not len(found[0]):
-            found.append(self._attempt(starts, first=False))
+        found = [np.zeros((0, space.nq))]
+        inside = first[space.excess(first).max(axis=1, initial=0.0) <= 1e-9]
+        if len(inside):
+            found.append(self._attempt(inside, iterations=12))
+        if every or not len(found[-1]):
+            found.append(self._raced(every=every))
+        if every or not len(found[-1]):
+            starts = np.stack([self.start, space.middle(self.start, moved)])
+            found.append(self._attempt(starts))
         blocks = iter(_BLOCKS)
         size = next(blocks)
         while self.used < self.restarts and (every or not sum(map(len, found))):
@@ -52,10 +57,24 @@ class Search:
             self.used += n
             found.append(self._attempt(q, first=not every))
             size = next(blocks, size)
-        return np.concatenate(found) if found else np.zeros((0, space.nq))
+        return np.concatenate(found)
 
-    def _attempt(self, q: Array, *, first: bool) -> Array:
-        end = descend(self.problem, q, first=first)
+    def _raced(self, *, every: bool) -> Array:
+        """Solutions of compiled searches, where the goal is a pose of one chain."""
+        racer = racer_of(self.problem, self.start)
+        if racer is None:
+            return np.zeros((0, self.problem.space.nq))
+        middle = self.problem.space.middle(self.start, self.problem.moved)
+        starts = np.stack([self.start, middle])
+        if every:
+            random = self.problem.space.random(self.rng, self.restarts, self.start, self.problem.moved)
+            starts = np.concatenate([starts, random])
+        q, spent = racer(starts, most=_MOST if not every else _MOST // 10)
+        self.iterations += spent
+        return self._attempt(q, iterations=12) if len(q) else q
+
+    def _attempt(self, q: Array, *, first: bool = False, iterations: int = 100) -> Array:
+        end = descend(self.problem, q, first=first, iterations=iterations)
         self.iterations += end.iterations
         self.ends += end.cost[~end.met].tolist()
         self._remember(end)

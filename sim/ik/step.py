@@ -69,7 +69,10 @@ def step_tape(chain: Chain) -> Tape:
     W = [_free(x, y, *limits) for x, y, limits in zip(q, g, chain.limits.tolist(), strict=True)]
     damping = _MU * _dot(e, e) + _LEAST
     if chain.n >= len(e):
-        A = [[_total(w * c[i] * c[k] for w, c in zip(W, J, strict=True)) for k in range(i + 1)] for i in range(len(e))]
+        A = [
+            [_total(w * c[i] * c[k] for w, c in zip(W, J, strict=True)) for k in range(i + 1)]
+            for i in range(len(e))
+        ]
         y = _solve(A, damping, e)
         d = [-(w * _dot(c, y)) for w, c in zip(W, J, strict=True)]
     else:

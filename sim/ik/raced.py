@@ -1,0 +1,153 @@
+"""Problems of one pose of one chain, handed to the compiled search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import rotations
+from ..errors import ModelError
+from ..kinematics import Frame
+from .goals import BAND, Orientation, Pose, Position
+from .pose import Kinematics, parse_frame
+from .problem import Problem
+from .race import Raced, Racer, racer
+from .reach import standing
+from .space import Space
+from .step import Chain, fits
+
+Array = NDArray[np.float64]
+
+
+def racer_of(problem: Problem, start: Array) -> Callable[..., tuple[Array, int]] | None:
+    """Compiled search for a problem of one Position, Orientation or Pose of a chain; None for others.
+
+    Takes starts (k, nq) and the most iterations; gives solutions (j, nq) to polish and iterations spent.
+    """
+    if len(problem.goals) != 1 or problem.loops:
+        return None
+    goal = problem.goals[0]
+    if not isinstance(goal, (Position, Orientation, Pose)) or goal.relative_to is not None:
+        return None
+    tolerance = goal.tolerances()
+    if (tolerance > BAND).any():
+        return None
+    frame = moving_part(problem.kinematics.frame(goal.at), problem.moved, start)
+    if not fits(frame):
+        return None
+    chain = Chain(frame, _limits(problem.space, frame), *_rows_of(goal), problem.scale)
+    compiled = _compiled(chain.fingerprint(), chain)
+    R = np.eye(3) if isinstance(goal, Position) else rotations.to_matrix(goal.quat)
+    p = np.zeros(3) if isinstance(goal, Orientation) else _position(goal)
+    columns = [j.q for j in frame.joints]
+
+    def run(starts: Array, most: int) -> tuple[Array, int]:
+        out, spent = [], 0
+        for q in starts:
+            raced = compiled(q[columns], R, p, tolerance=(1e-6, 1e-6), most=most)
+            spent += int(raced.iterations[0])
+            if raced.met[0]:
+                full = start.copy()
+                full[columns] = raced.q[0]
+                out.append(full)
+            if raced.met[0] != (
+                len(starts) > 2
+            ):  # one solution is enough, or one failure where all are wanted
+                break
+        return np.array(out).reshape(-1, problem.space.nq), spent
+
+    return run
+
+
+@lru_cache(maxsize=64)
+def _cached(fingerprint: str, holder: _Holder) -> Racer:
+    return racer(holder.chain)
+
+
+class _Holder:
+    """Carries a chain past the cache, which looks at the fingerprint alone."""
+
+    def __init__(self, chain: Chain):
+        self.chain = chain
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Holder)
+
+
+def _compiled(fingerprint: str, chain: Chain) -> Racer:
+    return _cached(fingerprint, _Holder(chain))
+
+
+def _rows_of(goal: Position | Orientation | Pose) -> tuple[bool, bool]:
+    return not isinstance(goal, Orientation), not isinstance(goal, Position)
+
+
+def _position(goal: Position | Pose) -> Array:
+    return np.asarray(goal.target if isinstance(goal, Position) else goal.position, dtype=float)
+
+
+def moving_part(f: Frame, moved: NDArray[np.bool_], start: Array) -> Frame:
+    """The frame with only the joints that move; the others stand as in `start` (nq,)."""
+    joints, X = [], np.eye(4)
+    for joint in f.joints:
+        X = X @ joint.X
+        if moved[joint.v]:
+            joints.append(joint._replace(X=X))
+            X = np.eye(4)
+        else:
+            X = X @ standing(joint, start)
+    return replace(f, joints=tuple(joints), X_end=X @ f.X_end)
+
+
+def _limits(space: Space, frame: Frame) -> Array:
+    return np.array([[space.low[j.v], space.high[j.v]] for j in frame.joints])
+
+
+class ChainSolver:
+    """Inverse kinematics of one frame of a fixed chain in microseconds, for live use; no verdict, no wishes.
+
+    >>> arm = ChainSolver(model, "tip")
+    >>> arm(R, p, seed=q[arm.columns]).met
+    """
+
+    def __init__(self, model: mujoco.MjModel, at: str, *, position: bool = True, rotation: bool = True):
+        """Compile the chain of frame `at`; ModelError for joints other than hinges and slides."""
+        kinematics, space = Kinematics(model), Space(model)
+        frame = kinematics.frame(at)
+        if not fits(frame):
+            raise ModelError(
+                f"the chain of {' '.join(parse_frame(at))!r} has no or other joints than hinges and slides"
+            )
+        offsets = [j.X[:3, 3] for j in frame.joints[1:]] + [frame.X_end[:3, 3]]
+        scale = max(0.5 * sum(float(np.linalg.norm(x)) for x in offsets), 1e-3)
+        self.chain = Chain(frame, _limits(space, frame), position, rotation, scale)
+        self.columns = np.array([j.q for j in frame.joints])
+        self.racer = _compiled(self.chain.fingerprint(), self.chain)
+
+    @property
+    def middle(self) -> Array:
+        """Mid-range configuration (n,); the reference where a joint has no limits."""
+        rest = np.array([j.rest for j in self.chain.frame.joints])
+        mean = self.chain.limits.mean(axis=1)
+        return np.where(np.isfinite(mean), mean, rest)
+
+    def __call__(
+        self,
+        R: ArrayLike,
+        p: ArrayLike,
+        *,
+        seed: ArrayLike | None = None,
+        tolerance: float = 1e-6,
+        most: int = 8000,
+    ) -> Raced:
+        """Joint values (k, n) for targets R (k, 3, 3), p (k, 3) [m], `tolerance` of every component [m, rad]."""
+        start = self.middle if seed is None else seed
+        return self.racer(start, R, p, tolerance=(tolerance, tolerance), most=most)
