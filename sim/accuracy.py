@@ -21,17 +21,21 @@ def estimate_error(
     Solving Ordinary Differential Equations I, II.4), with the same control samples at half the step.
 
     Contacts and limits break the order p: from the first event on, p = 1 is assumed, and
-    ``trusted_until`` says when that begins.
+    ``trusted_until`` says when that begins. Infinite where the run at half the step has diverged.
+    Raises KeyboardInterrupt when it was interrupted.
     """
     half = dataclasses.replace(problem, step=problem.step / 2, sample_every=2 * problem.sample_every)
     replay = Replay(period, segment.tick_ctrl, segment.tick_qfrc) if period and len(segment.tick_t) else None
     span = (float(segment.t[0]), float(segment.t[-1]))
     finer = engine.run(half, span, replay)
+    if finer.status == "interrupted":
+        raise KeyboardInterrupt
     n = min(len(finer.t), len(segment.t))
-    angle, length = difference(problem.model, segment.q[:n], finer.q[:n])
+    angle, length = np.full((2, len(segment.t)), np.inf)
+    angle[:n], length[:n] = difference(problem.model, segment.q[:n], finer.q[:n])
     order = ORDER.get(problem.integrator, 1)
     first = min((e.t for e in events if e.kind in ("contact", "limit")), default=np.inf)
-    p = np.where(segment.t[:n] < first, order, 1)
+    p = np.where(segment.t < first, order, 1)
     factor = 2.0**p / (2.0**p - 1.0)
     return ErrorEstimate(
         angle=angle * factor,

@@ -21,6 +21,8 @@ from .recording import Recording, model_to_bytes
 from .scene.load import load_scene
 from .scene.schema import Scene
 
+_UNCHECKED = "not searched for overlaps and crossed limits: interrupted"
+
 
 def run(
     scene: Scene | Plan | str | Path,
@@ -41,10 +43,17 @@ def run(
     engine = make_engine(plan.engine.what)
     controls = _controls(plan)
     segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
-    derived = derive(problem, segment)
-    estimate = None
-    if error and segment.status == "done" and segment.stats["steps"]:
-        estimate = estimate_error(engine, problem, segment, derived.events, plan.period)
+    status, message, estimate, notes = segment.status, segment.message, None, [_UNCHECKED]
+    try:
+        derived = derive(problem, segment)
+        notes = check_frames(setup, segment.t, segment.q)
+        if error and status == "done" and segment.stats["steps"]:
+            estimate = estimate_error(engine, problem, segment, derived.events, plan.period)
+    except KeyboardInterrupt:
+        # the motion is there: what belongs to it is worth the moment that it takes
+        derived = derive(problem, segment)
+        if status == "done":
+            status, message = "interrupted", "interrupted after the simulation; the motion is whole"
     return Recording(
         t=segment.t,
         q=segment.q,
@@ -61,10 +70,10 @@ def run(
         tick_ctrl=segment.tick_ctrl,
         tick_qfrc=segment.tick_qfrc,
         events=derived.events,
-        status=segment.status,
-        message=segment.message,
+        status=status,
+        message=message,
         stats=segment.stats,
-        notes=tuple(check_frames(setup, segment.t, segment.q)),
+        notes=tuple(notes),
         scene=setup.scene.model_dump(mode="json", exclude_defaults=True) | {"format": setup.scene.format},
         versions=_versions(),
         model_bytes=model_to_bytes(problem.model),

@@ -1,0 +1,240 @@
+import _thread
+import sys
+import threading
+import time
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pantograph.sim import Scene, load, make_plan, run
+from scenes import numbers, scenes
+
+FALL = {"duration": 2.0, "models": [{"file": "double_pendulum"}], "initial": {"position": {"shoulder": 2.0}}}
+TRACKED = {
+    "duration": 1.0,
+    "models": [{"file": "arm6"}],
+    "roles": {"tracked": ["elbow", "wrist_pitch"]},
+    "keys": [
+        {"joint": "waist", "times": [0, 0.4, 1], "values": [0, 1, 0.3]},
+        {"joint": "elbow", "times": [0, 0.5, 1], "values": [0.4, 1, 0.4]},
+    ],
+}
+SAMPLED = ("t", "q", "v", "a", "tau", "ctrl", "kinetic", "potential", "normal")
+
+
+def test_a_scene_its_plan_and_its_file_run_alike(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text('duration = 0.1\n[[models]]\nfile = "pendulum"\n[initial.position]\nhinge = 1\n')
+    scene = Scene(duration=0.1, models=[{"file": "pendulum"}], initial={"position": {"hinge": 1}})
+    runs = [run(path), run(str(path)), run(scene), run(make_plan(scene))]
+    for r in runs:
+        np.testing.assert_array_equal(r.q, runs[0].q)
+        assert r.status == "done"
+        assert Scene(**r.scene) == scene
+
+
+@given(scenes())
+@settings(max_examples=15)
+def test_two_runs_are_equal_to_the_last_bit(data):
+    one, two = run(Scene(**data)), run(Scene(**data))
+    for name in (*SAMPLED, "tick_t", "tick_ctrl", "tick_qfrc"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert one.events == two.events
+
+
+@given(st.sampled_from([FALL, TRACKED]), st.integers(1, 200))
+@settings(max_examples=20)
+def test_an_interrupted_run_keeps_the_beginning_of_the_whole_one(tmp_path_factory, data, calls):
+    whole = run(Scene(**data))
+    left = calls
+
+    def progress(t):
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise KeyboardInterrupt
+
+    r = run(Scene(**data), progress=progress)
+    if left > 0:
+        assert r.status == "done"
+        return
+    assert r.status == "interrupted"
+    assert "interrupted at t = " in r.message
+    n = len(r.t)
+    assert 0 < n < len(whole.t)
+    for name in SAMPLED:
+        np.testing.assert_array_equal(getattr(r, name), getattr(whole, name)[:n])
+    np.testing.assert_array_equal(r.tick_qfrc, whole.tick_qfrc[: len(r.tick_t)])
+    again = load(r.save(tmp_path_factory.getbasetemp() / "interrupted.npz"))
+    np.testing.assert_array_equal(again.q, r.q)
+    assert again.status == "interrupted"
+
+
+@pytest.mark.parametrize("after", [0.05, 0.2, 0.35])
+def test_an_interrupt_at_any_moment_of_the_simulation_is_kept(after):
+    scene = Scene(**{**FALL, "duration": 1e4}, rate=1.0)
+    started = threading.Event()
+
+    def interrupt():
+        started.wait()
+        time.sleep(after)
+        _thread.interrupt_main()
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    r = run(scene, progress=lambda _: started.set())
+    thread.join()
+    assert r.status == "interrupted"
+    assert len(r.t) == len(r.q) == len(r.a) > 0
+    assert r.t[-1] < 1e4
+
+
+@pytest.mark.parametrize("late", ["derive", "check_frames", "estimate_error"])
+def test_an_interrupt_after_the_simulation_loses_no_motion(late, monkeypatch):
+    module = sys.modules[run.__module__]
+    whole, real, calls = run(Scene(**FALL)), getattr(module, late), []
+
+    def interrupted_once(*args):
+        calls.append(1)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(module, late, interrupted_once)
+    r = run(Scene(**FALL), error=True)
+    assert (r.status, r.message) == ("interrupted", "interrupted after the simulation; the motion is whole")
+    assert r.error is None
+    for name in SAMPLED:
+        np.testing.assert_array_equal(getattr(r, name), getattr(whole, name))
+    assert any("interrupted" in note for note in r.notes) == (late != "estimate_error")
+
+
+def test_an_interrupt_of_the_second_run_gives_no_estimate(monkeypatch):
+    module = sys.modules[run.__module__]
+    engine = module.make_engine("contact")
+    runs = []
+
+    class Interrupted:
+        name = "contact"
+
+        def run(self, problem, t_span, controls, *, progress=None):
+            runs.append(problem.step)
+
+            def stop(t):
+                if len(runs) == 2 and t > 1.0:
+                    raise KeyboardInterrupt
+
+            return engine.run(problem, t_span, controls, progress=stop)
+
+    monkeypatch.setattr(module, "make_engine", lambda _: Interrupted())
+    r = run(Scene(**FALL), error=True)
+    assert runs == [0.002, 0.001]
+    assert r.status == "interrupted"
+    assert r.error is None
+    assert r.t[-1] == pytest.approx(2.0)
+
+
+SPRING = """<mujoco><worldbody>
+  <body name="calm"><joint name="calm" type="slide"/>
+    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>
+  <body name="b"><joint name="spring" type="slide" stiffness="{k}"/>
+    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+
+
+@given(st.floats(5.0, 9.0), st.sampled_from(["rk4", "euler"]), st.floats(0.01, 1.0))
+@settings(max_examples=10)
+def test_a_diverging_run_says_when_where_and_why_and_keeps_what_it_has(
+    tmp_path_factory, log_k, integrator, x
+):
+    """A mass of 1 kg on a spring of k N/m, h = 0.02 s: unstable for h sqrt(k) > 2.8 (RK4) or 2 (Euler)."""
+    path = tmp_path_factory.getbasetemp() / "spring.xml"
+    path.write_text(SPRING.format(k=10**log_k))
+    scene = Scene(
+        duration=20.0,
+        models=[{"file": str(path)}],
+        initial={"position": {"spring": x}},
+        physics={"gravity": False},
+        solver={"integrator": integrator, "step": 0.02},
+    )
+    r = run(scene, error=True)
+    assert r.status == "diverged"
+    for part in ("diverged at t = ", "'spring'", integrator, "0.02 s", "stiff", "smaller step"):
+        assert part in r.message
+    assert 0 < len(r.t) < 2400
+    for name in SAMPLED:
+        assert np.isfinite(getattr(r, name)).all(), name
+    assert r.q[0, 1] == x
+    assert r.error is None
+    assert run(Scene(**{**scene.model_dump(), "solver": {"step": 1e-5}, "duration": 0.01})).status == "done"
+
+
+def independent(model):
+    """The model for plain MuJoCo calls: what the scene switched off stays off, energies on."""
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    return model, mujoco.MjData(model)
+
+
+@given(numbers, numbers, numbers, numbers, st.booleans(), st.sampled_from(["rk4", "euler", "discrete"]))
+@settings(max_examples=15)
+def test_derived_quantities_belong_to_the_recorded_state(q1, q2, v1, v2, loaded, integrator):
+    """planar_2r: accelerations, energies by MuJoCo from q and v alone, at every sample."""
+    scene = Scene(
+        duration=0.3,
+        models=[{"file": "planar_2r"}],
+        initial={"position": {"shoulder": q1, "elbow": q2}, "velocity": {"shoulder": v1, "elbow": v2}},
+        forces=[{"body": "forearm", "force": [3, 1, 20], "torque": [0, 2, 0]}] if loaded else [],
+        solver={"integrator": integrator},
+    )
+    r = run(scene)
+    model, data = independent(make_plan(scene).problem.model)
+    for i in range(0, len(r.t), 7):
+        data.qpos[:], data.qvel[:] = r.q[i], r.v[i]
+        if loaded:
+            data.body("forearm").xfrc_applied[:] = [3, 1, 20, 0, 2, 0]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(r.a[i], data.qacc, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose([r.potential[i], r.kinetic[i]], data.energy, rtol=1e-12, atol=1e-12)
+        height = model.body_mass @ data.xipos[:, 2]
+        assert r.potential[i] == pytest.approx(9.81 * height, abs=1e-9)
+    assert not r.tau.any()
+    assert not r.normal.any()
+
+
+def test_drive_forces_of_all_roles_are_what_inverse_dynamics_asks_for():
+    scene = Scene(**TRACKED, physics={"contacts": "none", "limits": False, "friction": False})
+    r = run(scene)
+    model = make_plan(scene).problem.model
+    model.opt.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    )
+    data = mujoco.MjData(model)
+    for i in range(0, len(r.t), 10):
+        data.qpos[:], data.qvel[:], data.qacc[:] = r.q[i], r.v[i], r.a[i]
+        mujoco.mj_inverse(model, data)
+        np.testing.assert_allclose(r.tau[i], data.qfrc_inverse, atol=1e-6)
+    passive = ~(r.keyed | r.tracked)
+    assert passive.any()
+    assert r.keyed.any()
+    np.testing.assert_allclose(r.tau[:, passive], 0.0, atol=1e-12)
+    clip = make_plan(scene).problem.clip.evaluate(r.t)
+    for moved, keyed in ((r.q, clip.q), (r.v, clip.v), (r.a, clip.a)):
+        np.testing.assert_allclose(moved[:, r.keyed], keyed[:, r.keyed], atol=1e-8)
+
+
+def test_the_normal_force_carries_the_weight_of_what_rests():
+    scene = Scene(
+        duration=3.0,
+        props=[
+            {"name": "floor", "shape": "plane", "size": [3, 3], "fixed": True},
+            {"name": "box", "shape": "box", "size": [0.1, 0.1, 0.1], "mass": 2.0, "position": [0, 0, 0.11]},
+        ],
+    )
+    r = run(scene)
+    assert r.normal[0] == 0
+    assert r.normal[-1] == pytest.approx(2 * 9.81, rel=1e-3)
+    assert [e.kind for e in r.events][:1] == ["contact"]
+    fall = np.sqrt(2 * 0.01 / 9.81)
+    assert r.events[0].t == pytest.approx(fall, abs=2 / 120)
+    assert "box" in r.events[0].what
