@@ -61,9 +61,8 @@ class Sampled:
         tau, self.memory = self.law(t, q, v, target, self.memory)
         qfrc = np.where(self.tracked, tau, 0.0)
         ctrl = np.zeros(self.nu)
-        for actuator in self.actuators:
-            ctrl[actuator.index] = actuator.ctrl_for(float(qfrc[actuator.dof]), q, v)
-            qfrc[actuator.dof] = 0.0
+        ctrl[self.actuators.index] = self.actuators.ctrl_for(qfrc, q, v)
+        qfrc[self.actuators.dof] = 0.0
         return Held(ctrl, qfrc)
 
 
@@ -80,47 +79,47 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class JointActuator:
-    """An actuator on one joint, MuJoCo's affine law: force = (g0 + g1 l + g2 l') ctrl + b0 + b1 l + b2 l',
-    l = gear q, joint force = gear * force (MuJoCo documentation, Computation, Actuation model)."""
+class JointActuators:
+    """The n actuators, each on one joint, that a controller drives, by MuJoCo's affine law:
+    force = (g0 + g1 l + g2 l') ctrl + b0 + b1 l + b2 l', l = gear q, joint force = gear * force
+    (MuJoCo documentation, Computation, Actuation model).
 
-    index: int
-    dof: int
-    qpos: int
-    gear: float
+    index, dof, qpos (n,) in the model; gear, low, high (n,); gain, bias (n, 3).
+    """
+
+    index: NDArray[np.intp]
+    dof: NDArray[np.intp]
+    qpos: NDArray[np.intp]
+    gear: Array
     gain: Array
     bias: Array
-    ctrl_range: tuple[float, float]
+    low: Array
+    high: Array
 
-    def ctrl_for(self, tau: float, q: Array, v: Array) -> float:
-        """The ctrl that gives joint force ``tau`` [N, N m] now, within the control range."""
-        length, rate = self.gear * q[self.qpos], self.gear * v[self.dof]
-        now = np.array([1.0, length, rate])
-        gain = float(self.gain @ now)
-        force = tau / self.gear
-        ctrl = (force - float(self.bias @ now)) / gain if gain != 0.0 else 0.0
-        return float(np.clip(ctrl, *self.ctrl_range))
+    def ctrl_for(self, tau: Array, q: Array, v: Array) -> Array:
+        """The ctrl (n,) that give joint forces ``tau`` (nv,) [N, N m] now, within the control ranges."""
+        now = np.stack([np.ones(len(self.gear)), self.gear * q[self.qpos], self.gear * v[self.dof]], axis=1)
+        gain, bias = (self.gain * now).sum(axis=1), (self.bias * now).sum(axis=1)
+        force = tau[self.dof] / self.gear - bias
+        ctrl = np.divide(force, gain, out=np.zeros_like(force), where=gain != 0.0)
+        return np.minimum(np.maximum(ctrl, self.low), self.high)
 
 
-def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> tuple[JointActuator, ...]:
+def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> JointActuators:
     """The actuators that the controller drives."""
-    found = []
-    for i in np.flatnonzero(drives == Drive.CONTROLLER):
-        joint = int(model.actuator_trnid[i, 0])
-        limited = bool(model.actuator_ctrllimited[i])
-        low, high = model.actuator_ctrlrange[i] if limited else (-np.inf, np.inf)
-        found.append(
-            JointActuator(
-                index=int(i),
-                dof=int(model.jnt_dofadr[joint]),
-                qpos=int(model.jnt_qposadr[joint]),
-                gear=float(model.actuator_gear[i, 0]),
-                gain=model.actuator_gainprm[i, :3].copy(),
-                bias=model.actuator_biasprm[i, :3].copy(),
-                ctrl_range=(float(low), float(high)),
-            )
-        )
-    return tuple(found)
+    index = np.flatnonzero(drives == Drive.CONTROLLER)
+    joints = model.actuator_trnid[index, 0]
+    limited = model.actuator_ctrllimited[index].astype(bool)
+    return JointActuators(
+        index=index,
+        dof=model.jnt_dofadr[joints].astype(np.intp),
+        qpos=model.jnt_qposadr[joints].astype(np.intp),
+        gear=model.actuator_gear[index, 0].copy(),
+        gain=model.actuator_gainprm[index, :3].copy(),
+        bias=model.actuator_biasprm[index, :3].copy(),
+        low=np.where(limited, model.actuator_ctrlrange[index, 0], -np.inf),
+        high=np.where(limited, model.actuator_ctrlrange[index, 1], np.inf),
+    )
 
 
 def why_not_controllable(model: mujoco.MjModel, i: int) -> str:

@@ -52,16 +52,27 @@ class Layout:
     """Sizes and addresses of state and prescribed inputs.
 
     The state is x = (q, v, act) over the joints that are not keyed; the prescribed motion is w = (q, v, a)
-    over the keyed ones, each part in the model's order.
+    over the keyed ones, each part in the model's order, and after it the controls of the `timed` actuators.
+    The held controls u are those of the other actuators and, with `forces`, generalized forces on the
+    freedoms of the state.
 
     Attributes:
         q_free, v_free, q_keyed, v_keyed: addresses in the model's qpos and qvel.
         quaternions: first entries of quaternions in q (state).
+        u_held: actuators whose controls are in u.
         blocks: (kind, first entry in q, first entry in v) of every free joint, in order.
     """
 
-    def __init__(self, model: mujoco.MjModel, keyed: tuple[int, ...] = ()):
-        self.keyed = keyed
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        keyed: tuple[int, ...] = (),
+        *,
+        timed: tuple[int, ...] = (),
+        forces: bool = False,
+    ):
+        self.keyed, self.timed, self.forces = keyed, timed, forces
+        self.u_held = [i for i in range(model.nu) if i not in timed]
         self.q_free: list[int] = []
         self.v_free: list[int] = []
         self.q_keyed: list[int] = []
@@ -78,7 +89,8 @@ class Layout:
                     self.quaternions.append(len(q) + (3 if kind == FREE else 0))
             q += range(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + COORDINATES[kind])
             v += range(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + DOFS[kind])
-        self.nq, self.nv, self.na, self.nu = len(self.q_free), len(self.v_free), int(model.na), int(model.nu)
+        self.nq, self.nv, self.na = len(self.q_free), len(self.v_free), int(model.na)
+        self.nu = len(self.u_held) + (self.nv if forces else 0)
         self.nx = self.nq + self.nv + self.na
-        self.nw = len(self.q_keyed) + 2 * len(self.v_keyed)
+        self.nw = len(self.q_keyed) + 2 * len(self.v_keyed) + len(timed)
         self.nv_model = int(model.nv)

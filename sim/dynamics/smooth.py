@@ -108,6 +108,8 @@ def compile_model(
     keyed: Keyed = (),
     parameters: Sequence[Parameter] = (),
     friction_width: float | None = None,
+    timed: Sequence[int] = (),
+    forces: bool = False,
     lanes: int | None = None,
     threads: int | None = None,
     cache: FilePath | bool | None = True,
@@ -117,9 +119,11 @@ def compile_model(
     `keyed` names the joints whose motion is prescribed (names, ids, or a bool mask over freedoms);
     `parameters` model entries that become inputs `p`, as (field, name or row[, column]), e.g.
     ("body_mass", "forearm"), ("body_pos", "hand", 2), ("actuator_gainprm", "elbow", 0); `friction_width`
-    [rad/s or m/s] smooths dry friction (None leaves it out); `lanes` fixes the states computed side by side
-    in a batch (default: what the processor is best at); `threads` limits those used for batches; `cache` is
-    the folder of compiled code (True: the user's, None or False: none).
+    [rad/s or m/s] smooths dry friction (None leaves it out); the controls of the `timed` actuators (ids) move
+    from `u` to the end of `w`; with `forces`, `u` ends with generalized forces on the state's freedoms;
+    `lanes` fixes the states computed side by side in a batch (default: what the processor is best at);
+    `threads` limits those used for batches; `cache` is the folder of compiled code (True: the user's, None or
+    False: none).
 
     Raises EngineError naming everything in the model that the engine cannot do.
     """
@@ -132,7 +136,8 @@ def compile_model(
     if friction_width is not None and not friction_width > 0:
         raise EngineError(f"friction_width must be positive, not {friction_width}")
     folder = default_folder() if cache is True else (cache or None)
-    return Smooth(model, joints, tuple(parameters), friction_width, lanes, threads, Cache(folder))
+    layout = Layout(model, joints, timed=tuple(timed), forces=forces)
+    return Smooth(model, layout, tuple(parameters), friction_width, lanes, threads, Cache(folder))
 
 
 class Smooth:
@@ -146,7 +151,7 @@ class Smooth:
     def __init__(
         self,
         model: mujoco.MjModel,
-        joints: tuple[int, ...],
+        layout: Layout,
         parameters: tuple[Parameter, ...],
         friction_width: float | None,
         lanes: int | None,
@@ -154,7 +159,7 @@ class Smooth:
         cache: Cache,
     ):
         self.model = model
-        self.layout = Layout(model, joints)
+        self.layout = layout
         self.parameters, self.friction_width = parameters, friction_width
         self.lanes = lanes or jit.preferred_lanes()
         self.threads = threads or workers()
@@ -173,7 +178,8 @@ class Smooth:
     @cached_property
     def key(self) -> str:
         """Hash over everything that compiled code of this model depends on."""
-        roles = repr((self.layout.keyed, self.parameters, self.friction_width))
+        lay = self.layout
+        roles = repr((lay.keyed, lay.timed, lay.forces, self.parameters, self.friction_width))
         versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
         return key_of(model_fingerprint(self.model), roles, versions, _code_fingerprint())
 

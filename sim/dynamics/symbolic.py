@@ -86,7 +86,7 @@ class Equations:
             (v, lay.v_free, self.inputs["v"]),
             (q, lay.q_keyed, w[:nqk]),
             (v, lay.v_keyed, w[nqk : nqk + nvk]),
-            (a, lay.v_keyed, w[nqk + nvk :]),
+            (a, lay.v_keyed, w[nqk + nvk : nqk + 2 * nvk]),
         ):
             for address, node in zip(addresses, source, strict=True):
                 target[address] = node
@@ -127,11 +127,19 @@ class Equations:
     @cached_property
     def actuation(self) -> tuple[list[Scalar], list[Scalar]]:
         """Generalized forces of the actuators, and rates of their activations."""
-        return actuator_forces(self.fields, self.q, self.v, self.inputs["act"], self.inputs["u"])
+        lay, u, w = self.layout, self.inputs["u"], self.inputs["w"]
+        ctrl: list[Scalar] = [0.0] * self.model.nu
+        for actuator, node in zip(lay.u_held, u, strict=False):
+            ctrl[actuator] = node
+        for actuator, node in zip(lay.timed, w[lay.nw - len(lay.timed) :], strict=True):
+            ctrl[actuator] = node
+        return actuator_forces(self.fields, self.q, self.v, self.inputs["act"], ctrl)
 
     def driving(self, tau: Sequence[Scalar] | None = None) -> list[Scalar]:
         """Passive, actuator and applied (`tau`, over the state's freedoms) forces."""
         total = spatial.add(self.passive, self.actuation[0])
+        if self.layout.forces:
+            total = spatial.add(total, self.spread(self.inputs["u"][len(self.layout.u_held) :]))
         return total if tau is None else spatial.add(total, self.spread(tau))
 
     @cached_property

@@ -118,7 +118,7 @@ class Segment:
 
     t (n,), q (n, nq), v (n, nv), act (n, na); ticks hold the controller's samples: tick_t (m,),
     tick_ctrl (m, nu), tick_qfrc (m, nv). ``status`` is 'done', 'diverged' or 'interrupted';
-    ``message`` says why a run stopped early.
+    ``message`` says why a run stopped early; ``events`` are those that the engine itself located.
     """
 
     t: Array
@@ -131,6 +131,7 @@ class Segment:
     status: str
     message: str
     stats: dict[str, Any]
+    events: tuple[Event, ...] = ()
 
 
 class Engine(Protocol):

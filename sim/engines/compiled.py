@@ -1,0 +1,97 @@
+"""The machine code of a scene, and the motion it is prescribed, as the smooth engine steps it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .interface import Array, Held, Problem, Role
+from .limits import Limit
+from .timed import Timed
+
+if TYPE_CHECKING:
+    from ..integrate import Tableau
+
+CHUNK = 512  # steps computed in one call at most, and steps whose prescribed motion is evaluated at once
+
+
+class Compiled:
+    """The machine code of a run for one set of joints at rest, and the motion it is prescribed."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        timed: Timed,
+        t0: float,
+        method: Tableau,
+        *,
+        width: float | None,
+        resting: tuple[Limit, ...],
+    ) -> None:
+        from ..dynamics.smooth import compile_model
+        from ..dynamics.stepper import Stepper
+
+        keyed = np.flatnonzero(problem.roles == Role.KEYED).tolist()
+        self.timed, self.t0, self.h, self.resting = timed, t0, problem.step, resting
+        self.smooth = compile_model(
+            problem.model,
+            keyed=[*keyed, *(limit.joint for limit in resting)],
+            friction_width=width,
+            timed=timed.servos.tolist(),
+            forces=True,
+        )
+        lay = self.smooth.layout
+        self.nq, self.nv, self.nw = lay.nq, lay.nv, lay.nw
+        self.q_free, self.v_free = np.array(lay.q_free, dtype=int), np.array(lay.v_free, dtype=int)
+        self.q_keyed, self.v_keyed = np.array(lay.q_keyed, dtype=int), np.array(lay.v_keyed, dtype=int)
+        self.u_held = np.array(lay.u_held, dtype=int)
+        self.stepper = Stepper(self.smooth, method, CHUNK)
+        self.nodes = np.asarray(method.c)
+        self.timed_q = np.isin(self.q_keyed, timed.qpos)
+        self.timed_v = np.isin(self.v_keyed, timed.keyed)
+        self.grid: tuple[int, Array] = (-1, np.zeros((0, self.nw)))
+
+    def held(self, held: Held) -> Array:
+        """Held controls and joint forces as the compiled model takes them."""
+        return np.concatenate([held.ctrl[self.u_held], held.qfrc[self.v_free]])
+
+    def motion(self, w: Array) -> tuple[Array, Array]:
+        """Positions and velocities of the prescribed joints in rows ``w``."""
+        nqk, nvk = len(self.q_keyed), len(self.v_keyed)
+        return w[:, :nqk], w[:, nqk : nqk + nvk]
+
+    def on_grid(self, k: int, n: int) -> Array:
+        """Prescribed rows of steps ``k`` to ``k + n`` of the run, a chunk of them evaluated at once."""
+        first = k - k % CHUNK
+        if first != self.grid[0]:
+            # one chunk more than asked, since spans may straddle two
+            starts = self.h * np.arange(first, first + 2 * CHUNK)
+            self.grid = (first, self.prescribed(starts, self.h))
+        rows = self.stepper.rows
+        return self.grid[1][(k - first) * rows : (k - first + n) * rows]
+
+    def end(self, offset: float, on_grid: bool, k: int) -> Array:
+        """The prescribed row (1, nw) at one time."""
+        if on_grid and self.grid[0] <= k < self.grid[0] + 2 * CHUNK and self.grid[0] >= 0:
+            return self.grid[1][(k - self.grid[0]) * self.stepper.rows][None]
+        return self._rows(np.array([offset]), left=False)
+
+    def prescribed(self, starts: Array, step: float) -> Array:
+        """Rows (n * stages, nw) for steps that begin ``starts`` (n,) seconds after the run's start, stage by
+        stage; stages at a step's end take the limit from the left, where keys may bend."""
+        out = np.zeros((len(starts), len(self.nodes), self.nw))
+        if self.nw:
+            for i, node in enumerate(self.nodes):
+                out[:, i] = self._rows(starts + node * step, left=bool(node == 1.0))
+        return out.reshape(len(starts) * len(self.nodes), self.nw)
+
+    def _rows(self, offsets: Array, *, left: bool) -> Array:
+        nqk, nvk, out = len(self.q_keyed), len(self.v_keyed), np.zeros((len(offsets), self.nw))
+        inputs = self.timed.at(self.t0 + offsets, left=left)
+        q, v, a = out[:, :nqk], out[:, nqk : nqk + nvk], out[:, nqk + nvk : nqk + 2 * nvk]
+        q[:, self.timed_q], v[:, self.timed_v], a[:, self.timed_v] = inputs.q, inputs.v, inputs.a
+        for limit in self.resting:
+            q[:, self.q_keyed == limit.qpos] = limit.bound
+        out[:, nqk + 2 * nvk :] = inputs.ctrl
+        return out
