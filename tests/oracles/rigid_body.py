@@ -109,6 +109,9 @@ class Top:
     ) -> None:
         with mp.workdps(30):
             n, dn = (mp.matrix([mp.mpf(float(x)) for x in vector]) for vector in (axis, axis_rate))
+            # Exactly unit and orthogonal: at a turning point the phase feels the square root of an error.
+            n /= mp.norm(n)
+            dn -= mp.fdot(n, dn) * n
             self.I, self.S, self.mgl = mp.mpf(inertia), mp.mpf(spin_momentum), mp.mpf(mgl)
             self.L = self.I * _cross(n, dn)[2] + self.S * n[2]
             energy = self.I / 2 * mp.fdot(dn, dn) + self.mgl * n[2]

@@ -55,3 +55,56 @@ def bounce_times(count: int, *, height: float, restitution: float, g: float = 9.
 def rest_time(*, height: float, restitution: float, g: float = 9.81) -> float:
     """Time at which such a ball comes to rest after infinitely many bounces."""
     return float(np.sqrt(2 * height / g) * (1 + restitution) / (1 - restitution))
+
+
+def shaken_upright(
+    t: float, *, frequency: float, amplitude: float, g: float = 9.81, length: float = 1.0
+) -> float:
+    """Linear motion of a pendulum beside upright, released at 1, its pivot at amplitude cos(frequency t).
+
+    phi'' = (g - amplitude frequency^2 cos(frequency t)) / length phi, by Taylor series in 30 digits.
+    """
+    steps = max(1, round(t * frequency))
+    with mp.workdps(30):
+        h, w = mp.mpf(t) / steps, mp.mpf(frequency)
+        drive = mp.mpf(amplitude) * w * w
+        position, speed = mp.mpf(1), mp.mpf(0)
+        for n in range(steps):
+            stiffness = [
+                -drive * w**k * mp.cos(w * n * h + k * mp.pi / 2) / mp.factorial(k) for k in range(31)
+            ]
+            stiffness[0] += mp.mpf(g)
+            y = [position, speed]
+            for k in range(29):
+                force = mp.fdot(stiffness[: k + 1], y[k::-1]) / length
+                y.append(force / ((k + 1) * (k + 2)))
+            position = mp.polyval(y[::-1], h)
+            speed = mp.polyval([k * y[k] for k in range(30, 0, -1)], h)
+        return float(position)
+
+
+def double_pendulum_modes(tip: float, *, g: float = 9.81) -> tuple[np.ndarray, np.ndarray]:
+    """Small oscillations of masses 1 and `tip` on links of length 1: frequencies (2,) and modes in columns.
+
+    In angles from down M = [[1 + tip, tip], [tip, tip]] and K = g diag(1 + tip, tip). Modes have a
+    first angle of 1.
+    """
+    with mp.workdps(40):
+        m, total = mp.mpf(tip), 1 + mp.mpf(tip)
+        g = mp.mpf(g)
+        a, b, c = total * m - m * m, -2 * g * total * m, g * g * total * m
+        root = mp.sqrt(b * b - 4 * a * c)
+        squares = [(-b - root) / (2 * a), (-b + root) / (2 * a)]
+        second = [total * (g - s) / (s * m) for s in squares]
+        modes = np.array([[1.0, 1.0], [float(x) for x in second]])
+        return np.array([float(mp.sqrt(s)) for s in squares]), modes
+
+
+def chain_mode(n: int) -> np.ndarray:
+    """Displacements in the lowest mode of a hanging chain, top to bottom, 1 at the bottom: L_k(x)."""
+    with mp.workdps(40):
+        zeros = mp.polyroots(
+            mp.taylor(lambda x: mp.laguerre(n, 0, x), 0, n)[::-1], maxsteps=500, extraprec=400
+        )
+        x = min(mp.re(z) for z in zeros)
+        return np.array([float(mp.laguerre(k, 0, x)) for k in range(n)])[::-1]

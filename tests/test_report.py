@@ -1,0 +1,135 @@
+"""Reports: errors against a reference that knows its own, files, and sentences that follow from the rows."""
+
+import csv
+import json
+
+import mujoco
+import numpy as np
+import pytest
+from oracles import pendulum
+from pantograph.sim.errors import EngineError
+from pantograph.sim.hard_cases import HARD_CASES
+from pantograph.sim.report import Report, report
+from pantograph.sim.work_precision import Case, Row, runners, smooth_or_none, smooth_reference
+
+PENDULUM = """<mujoco><worldbody><body><joint axis="0 -1 0"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1e-14 1e-14 1e-14"/></body></worldbody></mujoco>"""
+BOX = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 0.3"><freejoint/>
+<geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+
+
+def swing(frames: int = 20) -> Case:
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    return Case("swing", model, np.array([2.0]), np.array([0.0]), 2.0, frames=frames)
+
+
+@pytest.fixture(scope="module")
+def swing_report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return report(swing(), folder, engines=("smooth", "mujoco", "scipy"), budget_s=0.01), folder
+
+
+def test_reference_is_right_within_its_own_uncertainty():
+    case = swing()
+    reference = smooth_reference(case, smooth_or_none(case.model)[0])
+    exact = pendulum.swing(case.times, 2.0)
+    assert np.abs(reference.motion.q[:, 0] - exact[:, 0]).max() < 10 * reference.uncertainty + 1e-13
+    assert 0 < reference.uncertainty < 1e-11
+
+
+def test_errors_are_those_of_the_closed_form():
+    case = swing()
+    exact = pendulum.swing(case.times, 2.0)[:, 0]
+    reference = smooth_reference(case, smooth_or_none(case.model)[0])
+    from pantograph.sim.work_precision import trajectory_error
+
+    seen = set()
+    for runner in runners(case, smooth_or_none(case.model)[0], ("smooth", "mujoco", "scipy")):
+        setting = list(runner.settings())[3]
+        motion = runner.run(setting)
+        true = np.abs(motion.q[:, 0] - exact).max()
+        assert trajectory_error(case, motion, reference.motion) == pytest.approx(true, rel=1e-3, abs=1e-12)
+        assert motion.evaluations > 0
+        seen.add((runner.engine, runner.method, runner.knob))
+    assert {engine for engine, _, _ in seen} == {"smooth", "mujoco", "scipy"} and len(seen) == 21
+
+
+def test_files(swing_report):
+    result, folder = swing_report
+    content = json.loads((folder / "report.json").read_text())
+    with (folder / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(content["rows"]) == len(result.rows) > 60
+    assert float(rows[5]["cpu_s"]) == result.rows[5].cpu_s
+    assert content["uncertainty"] == result.uncertainty
+    assert (folder / "report.png").read_bytes()[:4] == b"\x89PNG"
+    text = (folder / "report.txt").read_text()
+    assert result.reference in text and result.recommendation() in text
+
+
+def test_errors_fall_with_the_setting(swing_report):
+    result, _ = swing_report
+    for method, order in (("rk4", 4), ("dopri5", 5)):
+        rows = [r for r in result.rows if (r.engine, r.method, r.knob) == ("smooth", method, "step")]
+        usable = [r for r in rows if 1e-10 < r.error < 1e-3]
+        fit = np.polyfit(np.log([r.setting for r in usable]), np.log([r.error for r in usable]), 1)
+        assert fit[0] == pytest.approx(order, abs=0.5)
+    adaptive = [
+        r for r in result.rows if r.knob == "tolerance" and r.engine == "smooth" and r.method == "dop853"
+    ]
+    assert adaptive[-1].error < 1e-6 * adaptive[0].error
+
+
+def row(
+    engine: str, error: float, cpu: float, *, knob: str = "step", setting: float = 1e-3, n: int = 10
+) -> Row:
+    return Row(engine, "dopri5", knob, setting, error, cpu, 0.0, n)
+
+
+def test_recommendation_takes_the_cheapest_that_is_good_enough():
+    rows = (
+        row("smooth", 1e-4, 1.0),
+        row("smooth", 1e-7, 5.0),
+        row("mujoco", 1e-7, 50.0),
+        row("smooth", np.nan, 0.1),
+    )
+    lines = Report("x", rows, "reference", 1e-8).recommendation().splitlines()
+    assert "in 1 s" in lines[0] and "50 times less" in lines[0]
+    assert "in 5 s" in lines[1] and "10 times less" in lines[1]
+    assert "not that sure" in lines[2], "an error below the reference's own says nothing"
+    lines = Report("x", rows, "reference", 1e-12).recommendation().splitlines()
+    assert "nothing reaches it" in lines[2]
+
+
+def test_stiffness_is_said():
+    rows = tuple(
+        row("smooth", 1e-5, 1.0, knob="tolerance", setting=t, n=n) for t, n in ((1e-3, 900), (1e-6, 950))
+    )
+    assert "Stiff" in Report("x", rows, "reference", 0.0).recommendation()
+    rows = tuple(
+        row("smooth", 1e-5, 1.0, knob="tolerance", setting=t, n=n) for t, n in ((1e-3, 200), (1e-6, 950))
+    )
+    assert "Stiff" not in Report("x", rows, "reference", 0.0).recommendation()
+
+
+def test_stiff_servo_is_called_stiff():
+    """500 times longer than the decay: only stability limits the steps."""
+    servo = next(case for case in HARD_CASES if case.name == "stiff servo")
+    model = servo.case().model
+    long = Case("servo at rest", model, np.array([1.0]), np.array([0.0]), 2.0)
+    assert "Stiff" in report(long, engines=("smooth",), budget_s=0.01).recommendation()
+
+
+def test_a_model_with_contacts_is_compared_among_mujocos_integrators():
+    model = mujoco.MjModel.from_xml_string(BOX)
+    data = mujoco.MjData(model)
+    case = Case("box", model, data.qpos.copy(), data.qvel.copy(), 0.2, frames=5)
+    result = report(case, engines=("smooth", "mujoco"), budget_s=0.002)
+    assert {r.engine for r in result.rows} == {"mujoco"}
+    assert any("may touch" in note for note in result.notes)
+    assert result.uncertainty > 0
+
+
+def test_unknown_engines_are_named():
+    with pytest.raises(EngineError, match="did you mean 'mujoco'"):
+        report(swing(), engines=("mujoko",))
