@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 Array = NDArray[np.float64]
 
 
-def motion(model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float = 1e-12) -> Array:
+def motion(model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float = 1e-10) -> Array:
     """Configurations (n, nq) at times ``t`` (n,) [s] from t[0], of a model that nothing but itself drives."""
     data = mujoco.MjData(model)
     nq = model.nq
@@ -19,7 +19,7 @@ def motion(model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float
         mujoco.mj_forward(model, data)
         return np.concatenate([_qdot(model, data.qpos, data.qvel), data.qacc])
 
-    y = solve_ivp(rate, (t[0], t[-1]), np.concatenate([q0, v0]), "DOP853", t, rtol=rtol, atol=1e-13).y
+    y = solve_ivp(rate, (t[0], t[-1]), np.concatenate([q0, v0]), "DOP853", t, rtol=rtol, atol=1e-12).y
     q = np.ascontiguousarray(y[:nq].T)
     for row in q:
         mujoco.mj_normalizeQuat(model, row)
@@ -35,5 +35,6 @@ def _qdot(model: mujoco.MjModel, q: Array, v: Array) -> Array:
         if kind == 0:  # free
             out[iq : iq + 3] = v[iv : iv + 3]
             iq, iv = iq + 3, iv + 3
-        mujoco.mju_derivQuat(out[iq : iq + 4], q[iq : iq + 4], v[iv : iv + 3])
+        # velocities of ball and free joints are in the body's frame: qdot = q * (0, w) / 2
+        mujoco.mju_mulQuat(out[iq : iq + 4], q[iq : iq + 4], np.concatenate([[0.0], v[iv : iv + 3] / 2]))
     return out
