@@ -17,7 +17,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,10 +89,15 @@ class Found:
 
 @dataclass
 class Statistics:
-    """Packets so far. `missing` counts by servo answers that did not come when asked for."""
+    """Packets so far.
+
+    lost: answers that did not come, or came broken (one, when nobody answered a question to many); strays:
+    answers nobody waited for; missing, by servo: answers that did not come after all retries.
+    """
 
     sent: int = 0
     received: int = 0
+    lost: int = 0
     corrupt: int = 0
     strays: int = 0
     timeouts: int = 0
@@ -110,6 +115,7 @@ class Block:
         spans: (address, length) by servo.
         layout: Of the bytes, the same for all.
         zero, scale: (servos, registers): SI value = (count - zero) * scale.
+        fast: Every firmware answers fast sync reads.
     """
 
     names: tuple[str, ...]
@@ -118,21 +124,42 @@ class Block:
     layout: struct.Struct
     zero: Array
     scale: Array
+    fast: bool
 
-    @property
+    @cached_property
     def uniform(self) -> bool:
         """Whether one sync read reaches all; else it takes a bulk read."""
         return len(set(self.spans.values())) == 1
 
-    def decode(self, replies: dict[int, Reply]) -> Array:
-        """Values (servos, registers) in SI; a row of NaN for a servo that did not answer."""
-        unpack, nothing = self.layout.unpack, (np.nan,) * len(self.names)
-        size = self.layout.size
-        rows = [
-            unpack(r.data) if (r := replies.get(i)) is not None and len(r.data) == size else nothing
+    @cached_property
+    def silence(self) -> tuple[float, ...]:
+        """Row of counts of a servo that did not answer: NaN."""
+        return (np.nan,) * len(self.names)
+
+    def counts(self, replies: dict[int, Reply]) -> list[tuple[float, ...]]:
+        """Signed counts, a row of registers for each servo; `silence` for one that did not answer."""
+        unpack, size, silence = self.layout.unpack, self.layout.size, self.silence
+        return [
+            unpack(r.data) if (r := replies.get(i)) is not None and len(r.data) == size else silence
             for i in self.ids
         ]
-        return (np.array(rows) - self.zero) * self.scale
+
+    def si(self, counts: Sequence[Any] | Array) -> Array:
+        """SI values of counts (..., servos, registers)."""
+        return (np.array(counts, dtype=float) - self.zero) * self.scale
+
+    def decode(self, replies: dict[int, Reply]) -> Array:
+        """Values (servos, registers) in SI; a row of NaN for a servo that did not answer."""
+        return self.si(self.counts(replies))
+
+
+class _Question(NamedTuple):
+    """A read of many servos: instruction, bytes of its frame and of the answers, return delay [s]."""
+
+    body: bytes
+    sent: int
+    expected: int
+    delay: float
 
 
 @cache
@@ -207,6 +234,7 @@ class Driver:
         self._ok: int = _sdk().COMM_SUCCESS
         self._owner = threading.get_ident()
         self._stuff = not _sdk_stuffs()
+        self._kept: tuple[Block, bool, _Question] | None = None
 
     def close(self) -> None:
         """Close the port. Servos stay as they are."""
@@ -283,7 +311,7 @@ class Driver:
             self._wait(FRAME + len(body), STATUS + length, 1, FACTORY_RETURN_DELAY)
             reply = self._collect({id: length}).get(id)
             if reply is None:
-                self.statistics.missing[id] += 1
+                self.statistics.lost += 1
                 continue
             error = reply.error & ~ALERT
             if error == StatusError.CRC and attempt < self.retries:
@@ -291,6 +319,7 @@ class Driver:
             if error:
                 raise Refused(id, error, f"{self.label(id)} refused: {_hint(error)}")
             return reply
+        self.statistics.missing[id] += 1
         raise NoAnswer(
             id,
             f"{self.label(id)} does not answer at {self.port.getBaudRate():,} bit/s "
@@ -402,7 +431,12 @@ class Driver:
         layout = struct.Struct("<" + "".join(_PACK[r.size, r.signed] for r in first))
         zero = np.array([[float(r.zero) for r in rows[i]] for i in ids])
         scale = np.array([[r.scale for r in rows[i]] for i in ids])
-        return Block(tuple(names), tuple(ids), spans, layout, zero, scale)
+        fast = len(ids) > 1 and len(set(spans.values())) == 1 and all(self._reads_fast(i) for i in ids)
+        return Block(tuple(names), tuple(ids), spans, layout, zero, scale, fast)
+
+    def _reads_fast(self, id: int) -> bool:
+        first = self.tables[id].fast_read_firmware
+        return first is not None and self.firmware.get(id, 0) >= first
 
     def read_block(self, block: Block, *, retries: int | None = None) -> dict[int, Reply]:
         """Read a block of all servos in one transaction; who did not answer is asked again, then left out.
@@ -410,7 +444,7 @@ class Driver:
         A fast sync read where every firmware has it. A servo that is missing silences those behind it: it is
         asked last the next time.
         """
-        replies = self._read_many(block, block.ids, fast=self._fast(block))
+        replies = self._read_many(block, block.ids, fast=block.fast)
         for _ in range(self.retries if retries is None else retries):
             missing = [i for i in block.ids if i not in replies]
             if not missing:
@@ -422,28 +456,38 @@ class Driver:
                 self.statistics.missing[id] += 1
         return replies
 
-    def _fast(self, block: Block) -> bool:
-        def able(id: int) -> bool:
-            first = self.tables[id].fast_read_firmware
-            return first is not None and self.firmware.get(id, 0) >= first
-
-        return len(block.ids) > 1 and block.uniform and all(able(i) for i in block.ids)
-
     def _read_many(self, block: Block, ids: Sequence[int], *, fast: bool) -> dict[int, Reply]:
-        delay = max(self.return_delay.get(i, FACTORY_RETURN_DELAY) for i in ids)
+        question = self._question(block, ids, fast)
+        self.send(BROADCAST, question.body)
+        self._wait(question.sent, question.expected, len(ids), question.delay)
+        if fast:
+            replies = self._collect_fast(ids, block.layout.size)
+            self.statistics.lost += len(replies) < len(ids)
+            return replies
+        size = block.layout.size
+        replies = self._collect(dict.fromkeys(ids, size))
+        self.statistics.lost += len(ids) - len(replies) if replies else 1
+        return replies
+
+    def _question(self, block: Block, ids: Sequence[int], fast: bool) -> _Question:
+        """The packet of a read; that of the block kept last is made once."""
+        whole = ids is block.ids
+        if whole and self._kept is not None and self._kept[0] is block and self._kept[1] == fast:
+            return self._kept[2]
         if block.uniform:
-            address, length = block.spans[ids[0]]
-            packet = packets.sync_read(address, length, ids, fast=fast)
+            packet = packets.sync_read(*block.spans[ids[0]], ids, fast=fast)
         else:
             packet = packets.bulk_read((i, *block.spans[i]) for i in ids)
-        size = sum(block.spans[i][1] for i in ids)
-        self.send(BROADCAST, bytes((packet.instruction,)) + packet.params)
-        frame = FRAME + len(packet.params)
-        if fast:
-            self._wait(frame, 8 + 4 * len(ids) + size, len(ids), delay)
-            return self._collect_fast(ids, block.spans[ids[0]][1])
-        self._wait(frame, STATUS * len(ids) + size, len(ids), delay)
-        return self._collect({i: block.spans[i][1] for i in ids})
+        data = len(ids) * block.layout.size
+        question = _Question(
+            bytes((packet.instruction,)) + packet.params,
+            FRAME + len(packet.params),
+            (8 + 4 * len(ids) if fast else STATUS * len(ids)) + data,
+            max(self.return_delay.get(i, FACTORY_RETURN_DELAY) for i in ids),
+        )
+        if whole:
+            self._kept = (block, fast, question)
+        return question
 
     def _collect_fast(self, ids: Sequence[int], length: int) -> dict[int, Reply]:
         """Blocks of a fast reply; of a broken one, those in front of the break whose own CRC holds."""
@@ -474,10 +518,9 @@ class Driver:
     def sync_write(self, ids: Sequence[int], name: str, counts: Sequence[int]) -> None:
         """Write a register of many servos in one packet, in signed counts; nobody answers."""
         row = self.register(ids[0], name)
-        layout = struct.Struct("<B" + ("B" + _PACK[row.size, row.signed]) * len(ids))
         pairs = [x for pair in zip(ids, counts, strict=True) for x in pair]
-        head = struct.pack("<BHH", packets.Instruction.SYNC_WRITE, row.address, row.size)
-        self.send(BROADCAST, head + layout.pack(0, *pairs)[1:])
+        layout = _sync_layout(row.size, row.signed, len(ids))
+        self.send(BROADCAST, layout.pack(packets.Instruction.SYNC_WRITE, row.address, row.size, *pairs))
 
     def sync_read(self, ids: Sequence[int], name: str) -> Array:
         """Register of many servos (n,) in SI; NaN where no answer came."""
@@ -488,7 +531,7 @@ class Driver:
         """Time on the wire of a goal sync write and a read of a block [s]; the latency timer is not in it."""
         n, size = len(block.ids), sum(s[1] for s in block.spans.values())
         head = 14 + (n if block.uniform else 5 * n - 4)
-        fast = self._fast(block)
+        fast = block.fast
         status_ = 8 + 4 * n + size if fast else STATUS * n + size
         count = head + status_ + ((14 + 5 * n) if goals else 0)
         delays = [self.return_delay.get(i, FACTORY_RETURN_DELAY) for i in block.ids]
@@ -522,6 +565,12 @@ class Driver:
         finally:
             self.port.setBaudRate(before)
         return found
+
+
+@cache
+def _sync_layout(size: int, signed: bool, count: int) -> struct.Struct:
+    """Instruction, address, length, then ID and value of each servo."""
+    return struct.Struct("<BHH" + ("B" + _PACK[size, signed]) * count)
 
 
 def _hint(error: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil
@@ -10,33 +9,35 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from ..driver import Driver, Reply
+from ..driver import Driver
 from ..mapping import Bounds
 from ..rig import Rig
 from ..tables.rows import CENTRE, POSITION
 from .contract import Phase, Ready, RigFault, error_names
 
 Array = NDArray[np.float64]
+Rows = list[tuple[float, ...]]
 
 PATIENCE = 5  # cycles without an answer, or with an old goal, after which a servo is lost
 LAGGING = 10  # cycles behind its goal after which a servo is obstructed
 HEALTH_PERIOD = 1.0  # s between looks at voltage and temperature
 _STEP_MARGIN = 1.25  # of the greatest step of a goal over velocity limit x time
 _HOT = 2.0  # K below the temperature limit at which the rig stops, before the servo lets go by itself
-# columns of the feedback block
-_X, _V, _LOAD, _ERROR, _WATCHDOG, _TORQUE, _GOAL = range(7)
 
 
 @dataclass
 class Log:
-    """What every cycle did: lists of the same length, times [s] of the bus clock, angles [rad]."""
+    """What every cycle did: lists of the same length, times [s] of the bus clock, goals [rad].
+
+    feedback: counts of the feedback block, a row for each servo, NaN for one that did not answer.
+    """
 
     due: list[float] = field(default_factory=list)
     begun: list[float] = field(default_factory=list)
     ended: list[float] = field(default_factory=list)
     phase: list[Phase] = field(default_factory=list)
     goal: list[Array] = field(default_factory=list)
-    feedback: list[Array] = field(default_factory=list)
+    feedback: list[Rows] = field(default_factory=list)
     skipped: int = 0  # cycles that were due while another was still under way
     clamped: int = 0  # goals that software limits changed
     lost_goals: int = 0  # goals sent that a servo was seen not to have
@@ -58,14 +59,13 @@ class Loop:
         self.driver, self.rig, self.ready, self.log = driver, rig, ready, log
         self.period = 1.0 / rig.rate
         self.goal = ready.present.copy()  # last one sent [rad]
-        self.present = ready.present.copy()
+        self._x = [float(x) for x in self._counts(ready.present)]  # last position heard, in counts
         # A rig that stands outside of its soft limits may come back, not go further.
         self._low = np.minimum(bounds.low, ready.present)
         self._high = np.maximum(bounds.high, ready.present)
         self._speed = bounds.velocity
-        n = len(rig.ids)
-        self._silent, self._stale, self._behind = (np.zeros(n, dtype=int) for _ in range(3))
-        self._sent: deque[Array] = deque([self._counts(self.goal)], maxlen=PATIENCE + 2)
+        self._following = rig.following_error / POSITION
+        self._silent, self._stale, self._behind = ([0] * len(rig.ids) for _ in range(3))
         self._last = driver.clock.now()
         self._health_due = self._last
         self._health = driver.block(rig.ids, ["present_input_voltage", "present_temperature"])
@@ -73,8 +73,14 @@ class Loop:
         self._cost = driver.cycle_time(ready.block) + driver.margin
 
     @staticmethod
-    def _counts(angle: Array) -> Array:
-        return np.rint(angle / POSITION) + CENTRE
+    def _counts(angle: Array) -> list[int]:
+        counts: list[int] = (np.rint(angle / POSITION) + CENTRE).astype(int).tolist()
+        return counts
+
+    @property
+    def present(self) -> Array:
+        """Positions heard last (ns,) [rad]."""
+        return (np.array(self._x) - CENTRE) * POSITION
 
     def run(
         self, target: Callable[[float], Array | None], duration: float, phase: Phase, *, capped: bool = True
@@ -104,71 +110,82 @@ class Loop:
         begun = driver.clock.now()
         goal = self._limit(goal, begun)
         counts = self._counts(goal)
-        driver.sync_write(self.rig.ids, "goal_position", counts.astype(int).tolist())
+        driver.sync_write(self.rig.ids, "goal_position", counts)
         self.goal, self._last = goal, begun
-        self._sent.append(counts)
         rest = due + self.period - driver.clock.now()
         replies = driver.read_block(self.ready.block, retries=1 if rest > 2 * self._cost else 0)
-        feedback = self.ready.block.decode(replies)
+        rows = self.ready.block.counts(replies)
         log.due.append(due)
         log.begun.append(begun)
         log.ended.append(driver.clock.now())
         log.phase.append(phase)
         log.goal.append(goal)
-        log.feedback.append(feedback)
-        self._judge(feedback, replies, phase)
+        log.feedback.append(rows)
+        self._judge(rows, counts, phase)
         if driver.clock.now() >= self._health_due and due + self.period - driver.clock.now() > self._cost:
             self._look_at_health(phase)
 
     def _limit(self, goal: Array, now: float) -> Array:
         """Software limits: inside of the range, and no further per cycle than the speed allows."""
-        if not np.all(np.isfinite(goal)):
-            id = self.rig.ids[int(np.argmin(np.isfinite(goal)))]
-            raise RigFault("stream", f"the goal of {self.rig.label(id)} is not a number", servo=id)
         elapsed = min(max(now - self._last, self.period), PATIENCE * self.period)
         step = self._speed * (_STEP_MARGIN * elapsed) + POSITION
         wanted = goal
         goal = np.minimum(np.maximum(goal, self._low), self._high)
         goal = np.minimum(np.maximum(goal, self.goal - step), self.goal + step)
-        if np.max(np.abs(goal - wanted)) > POSITION:
-            self.log.clamped += 1
+        changed = goal != wanted
+        if changed.any():
+            if np.isnan(wanted).any():
+                id = self.rig.ids[int(np.argmax(np.isnan(wanted)))]
+                raise RigFault("stream", f"the goal of {self.rig.label(id)} is not a number", servo=id)
+            self.log.clamped += int(np.max(np.abs(goal - wanted)) > POSITION)
         return goal
 
-    def _judge(self, feedback: Array, replies: dict[int, Reply], phase: Phase) -> None:
-        """RigFault for a servo that is lost, in error, without torque, tripped, stale or far behind."""
-        rig = self.rig
-        heard = ~np.isnan(feedback[:, _X])
-        self._silent = np.where(heard, 0, self._silent + 1)
-        self.present = np.where(heard, feedback[:, _X], self.present)
-        counts = np.rint(feedback[:, _GOAL] / POSITION) + CENTRE
-        stale = heard & (counts != self._sent[-1])
-        if stale.any():
-            self.log.lost_goals += 1
-        self._stale = np.where(heard, np.where(stale, self._stale + 1, 0), self._stale + 1)
-        self.log.oldest_goal = max(self.log.oldest_goal, int(self._stale.max()))
-        behind = heard & (np.abs(feedback[:, _X] - self.goal) > rig.following_error)
-        self._behind = np.where(behind, self._behind + 1, 0)
-        bad = (
-            heard & ((feedback[:, _ERROR] != 0) | (feedback[:, _TORQUE] != 1) | (feedback[:, _WATCHDOG] < 0))
-        ) | (np.maximum(np.maximum(self._silent, self._stale) - PATIENCE + LAGGING, self._behind) >= LAGGING)
-        if bad.any():
-            raise self._fault(int(np.argmax(bad)), feedback, phase)
+    def _judge(self, rows: Rows, sent: list[int], phase: Phase) -> None:
+        """RigFault for a servo that is lost, in error, without torque, tripped, stale or far behind.
 
-    def _fault(self, i: int, feedback: Array, phase: Phase) -> RigFault:
+        In counts and without numpy, which would cost more than the SDK for a handful of servos.
+        """
+        silent, stale, behind, following = self._silent, self._stale, self._behind, self._following
+        bad, lost = -1, False
+        for i, (x, _, _, error, watchdog, torque, goal) in enumerate(rows):
+            if x != x:  # not heard: nor is it known whether it has its goal
+                silent[i] += 1
+                stale[i] += 1
+                if silent[i] >= PATIENCE and bad < 0:
+                    bad = i
+                continue
+            silent[i] = 0
+            self._x[i] = x
+            if goal == sent[i]:
+                stale[i] = 0
+            else:
+                stale[i] += 1
+                lost = True
+            behind[i] = behind[i] + 1 if abs(x - sent[i]) > following else 0
+            wrong = error or torque != 1 or watchdog < 0
+            if (wrong or stale[i] >= PATIENCE or behind[i] >= LAGGING) and bad < 0:
+                bad = i
+        self.log.lost_goals += lost
+        self.log.oldest_goal = max(self.log.oldest_goal, *stale)
+        if bad >= 0:
+            raise self._fault(bad, rows[bad], sent[bad], phase)
+
+    def _fault(self, i: int, row: tuple[float, ...], sent: int, phase: Phase) -> RigFault:
         id = self.rig.ids[i]
-        label, row = self.rig.label(id), feedback[i]
-        if row[_ERROR] > 0:
-            text = f"{label} reports a hardware error: {error_names(int(row[_ERROR]))}; it needs a reboot"
-        elif row[_WATCHDOG] < 0:
-            text = f"the bus watchdog of {label} tripped: it heard nothing for {self.rig.watchdog:g} s"
-        elif row[_TORQUE] == 0:
-            text = f"{label} lost its torque: did its supply break down, or did somebody switch it off?"
-        elif self._silent[i] >= PATIENCE:
+        label = self.rig.label(id)
+        x, _, _, error, watchdog, torque, _ = row
+        if self._silent[i]:
             text = f"{label} has not answered for {self._silent[i]} cycles: is its cable in?"
+        elif error:
+            text = f"{label} reports a hardware error: {error_names(int(error))}; it needs a reboot"
+        elif watchdog < 0:
+            text = f"the bus watchdog of {label} tripped: it heard nothing for {self.rig.watchdog:g} s"
+        elif torque != 1:
+            text = f"{label} lost its torque: did its supply break down, or did somebody switch it off?"
         elif self._stale[i] >= PATIENCE:
             text = f"{label} has not taken a goal for {self._stale[i]} cycles"
         else:
-            gap = abs(row[_X] - self.goal[i])
+            gap = abs(x - sent) * POSITION
             text = f"{label} is {gap:.3f} rad behind its goal: is something in its way?"
         return RigFault(phase, text, servo=id)
 

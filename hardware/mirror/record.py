@@ -104,7 +104,7 @@ class MirrorReport:
             )
         s = self.packets
         lines.append(
-            f"  packets: {s.sent} sent, {s.received} received, {s.corrupt} corrupt, {s.timeouts} timeouts, "
+            f"  packets: {s.sent} sent, {s.received} received, {s.lost} answers lost, {s.corrupt} corrupt, "
             f"{s.retries} retries; {self.lost_goals} goals lost, oldest {self.oldest_goal} cycles"
         )
         return "\n".join(lines + [f"  note: {n}" for n in self.notes])
@@ -132,7 +132,10 @@ def make_report(
     nj = len(mapping.joints)
     begun = np.array([log.begun[i] for i in rows])
     t = begun - begun[0] if len(rows) else np.zeros(0)
-    feedback = np.array([log.feedback[i] for i in rows]).reshape(len(rows), len(rig.ids), len(FEEDBACK))
+    counts = np.array([log.feedback[i] for i in rows], dtype=float)
+    feedback = counts.reshape(len(rows), len(rig.ids), len(FEEDBACK))
+    if outcome.ready is not None:
+        feedback = outcome.ready.block.si(feedback)
     commanded = measured = np.zeros((0, nj))
     tracking: tuple[Tracking, ...] = ()
     recording = None

@@ -189,6 +189,7 @@ def _recording(rig: Rig, driver: Driver, t: Array, q: Array) -> Recording | None
     speed = np.gradient(s, t, axis=0)
     log = Log(due=list(t), begun=list(t), ended=list(t), phase=["stream"] * len(t), goal=list(s))
     rest = np.zeros((s.shape[1], len(FEEDBACK) - 2))
-    log.feedback = [np.column_stack([a, b, rest]) for a, b in zip(s, speed, strict=True)]
+    # In SI already: no servo block was prepared for an outcome without `ready`.
+    log.feedback = [list(map(tuple, np.column_stack([a, b, rest]))) for a, b in zip(s, speed, strict=True)]
     outcome = Outcome(stop="limp: it never had torque", log=log)
     return make_report(outcome, rig, driver, mapping, model=rig.load_model()).recording

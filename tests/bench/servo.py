@@ -1,4 +1,4 @@
-"""The servo bus: wire time against the notes, and a million bytes of fuzz. `make bench NAME=servo`.
+"""The servo bus: wire time, a million bytes of fuzz, the mirror. `make bench NAME=servo`.
 
 A part is a function that returns figures; the last line is one JSON object of all of them.
 """
@@ -225,8 +225,10 @@ PARTS: tuple[Callable[[Console], list[Figure]], ...] = (wire_time, fuzz_parser, 
 
 
 def main() -> int:
+    from servo_mirror import PARTS as MIRROR  # which takes Figure from here
+
     console = Console()
-    figures = [figure for part in PARTS for figure in part(console)]
+    figures = [figure for part in (*PARTS, *MIRROR) for figure in part(console)]
     table = Table(title="Servo bus")
     for name in ("figure", "value", "unit", "bar", "holds"):
         table.add_column(name)
