@@ -4,39 +4,85 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any
+from importlib import import_module
+from typing import Any, cast
+
+import mujoco
 
 from .control import Law
 from .engines.interface import Engine, Problem, Role
 from .errors import PantographError, SceneError, unknown
 
 
-def _pd() -> Callable[..., Law]:
-    from ..controllers.pd import PD
+def _law(module: str, name: str) -> Callable[[], Callable[..., Law]]:
+    """Finds a law of the controllers when it is asked for."""
 
-    return PD
+    def find() -> Callable[..., Law]:
+        return cast(
+            "Callable[..., Law]", getattr(import_module(f"..controllers.{module}", __package__), name)
+        )
+
+    return find
 
 
-LAWS: dict[str, Callable[[], Callable[..., Law]]] = {"pd": _pd}
+LAWS: dict[str, Callable[[], Callable[..., Law]]] = {
+    "pd": _law("pd", "PD"),
+    "pid": _law("pid", "PID"),
+    "computed-torque": _law("computed_torque", "ComputedTorque"),
+    "operational-space": _law("operational_space", "OperationalSpace"),
+    "impedance": _law("impedance", "Impedance"),
+    "lqr": _law("lqr", "LQR"),
+}
 
 
-def make_law(name: str, problem: Problem, parameters: dict[str, Any]) -> Law:
-    """The law ``name`` for a problem. Raises SceneError for an unknown law or parameter, or a bad value."""
+def make_law(
+    name: str,
+    problem: Problem,
+    parameters: dict[str, Any],
+    period: float = 0.002,
+    *,
+    model: mujoco.MjModel | None = None,
+) -> Law:
+    """The law ``name`` for a problem, sampled every ``period`` [s].
+
+    A law takes what it needs of the problem by the names of its positional arguments, ``parameters`` by its
+    keywords; those of :class:`~pantograph.controllers.reality.Loop` put it behind real sensors and drives.
+    ``model`` is what the law believes the machine to be (default: what it is). Raises SceneError for an
+    unknown law or parameter, or a bad value.
+    """
+    from ..controllers.reality import LOOP_WORDS, with_reality
+
     check_law(name, parameters)
+    factory, believed = LAWS[name](), model or problem.model
+    offered = {
+        "model": believed,
+        "tracked": problem.dofs(Role.TRACKED),
+        "keyed": problem.dofs(Role.KEYED),
+        "q0": problem.state0.q,
+        "clip": problem.clip,
+        "period": period,
+        "duration": problem.duration,
+    }
+    needed = [p.name for p in inspect.signature(factory).parameters.values() if p.kind != p.KEYWORD_ONLY]
+    own = {word: value for word, value in parameters.items() if word not in LOOP_WORDS}
+    reality = {word: value for word, value in parameters.items() if word in LOOP_WORDS}
     try:
-        return LAWS[name]()(problem.model, problem.dofs(Role.TRACKED), problem.state0.q, **parameters)
+        law = factory(*(offered[word] for word in needed), **own)
+        return with_reality(law, believed, problem.state0.q, period, reality)
     except (TypeError, PantographError) as e:
         raise SceneError(str(e)) from e
 
 
 def check_law(name: str, parameters: dict[str, Any]) -> None:
     """Raise SceneError when there is no such law, or it has no such parameter."""
+    from ..controllers.reality import LOOP_WORDS
+
     if name not in LAWS:
         raise SceneError(unknown("law", name, LAWS, where="pantograph.controllers"))
     known = [p.name for p in inspect.signature(LAWS[name]()).parameters.values() if p.kind == p.KEYWORD_ONLY]
     for word in parameters:
-        if word not in known:
-            raise SceneError(unknown("parameter", word, known, where=f"law {name!r}"))
+        if word not in (*known, *LOOP_WORDS):
+            raise SceneError(unknown("parameter", word, (*known, *LOOP_WORDS), where=f"law {name!r}"))
 
 
 def make_engine(name: str) -> Engine:
@@ -49,4 +95,8 @@ def make_engine(name: str) -> Engine:
         from .engines.contact import ContactEngine
 
         return ContactEngine()
-    raise SceneError(unknown("engine", name, ("kinematic", "contact"), where="this Pantograph"))
+    if name == "smooth":
+        from .engines.smooth import SmoothEngine
+
+        return SmoothEngine()
+    raise SceneError(unknown("engine", name, ("kinematic", "smooth", "contact"), where="this Pantograph"))

@@ -102,7 +102,7 @@ class JointActuators:
         gain, bias = (self.gain * now).sum(axis=1), (self.bias * now).sum(axis=1)
         force = tau[self.dof] / self.gear - bias
         ctrl = np.divide(force, gain, out=np.zeros_like(force), where=gain != 0.0)
-        return np.minimum(np.maximum(ctrl, self.low), self.high)
+        return np.asarray(np.minimum(np.maximum(ctrl, self.low), self.high))
 
 
 def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> JointActuators:

@@ -11,6 +11,7 @@ from ..models import name_of
 from .compose import make_law
 from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
+from .engines.smooth import methods as smooth_methods
 from .errors import SceneError, unknown
 from .scene.build import Setup, build, resolve
 from .scene.mistakes import Mistake, SceneMistakes, report
@@ -77,8 +78,8 @@ def plan_setup(setup: Setup) -> Plan:
     mistakes = _solver(scene) + _misfits(setup)
     if mistakes:
         raise report(mistakes, scene._file, scene._lines)
-    engine = _engine(setup)
     touch = can_touch(model)
+    engine = _engine(setup, touch)
     period = _period(setup)
     h, step = _step(setup, engine.what, period)
     integrator = _integrator(setup, engine.what, touch, h)
@@ -94,6 +95,7 @@ def plan_setup(setup: Setup) -> Plan:
         drives=setup.drives,
         servo=setup.servo,
         wrenches=setup.wrenches,
+        tolerance=scene.solver.tolerance,
     )
     if mistakes := _law(problem, scene):
         raise report(mistakes, scene._file, scene._lines)
@@ -104,7 +106,7 @@ def plan_setup(setup: Setup) -> Plan:
         step,
         problem,
         period,
-        tuple(_left_out(setup, engine.what)),
+        tuple(_left_out(setup, engine.what) + _other_physics(problem, engine.what)),
         tuple(_cheaper(setup, engine.what, integrator.what, touch)),
     )
 
@@ -112,14 +114,15 @@ def plan_setup(setup: Setup) -> Plan:
 def _solver(scene: Scene) -> list[Mistake]:
     """Choices of the solver that no engine offers."""
     solver, mistakes = scene.solver, []
-    if solver.engine == "smooth":
-        message = "this version has no smooth engine; it has: kinematic, contact"
-        mistakes.append(Mistake(("solver", "engine"), message))
-    if solver.integrator not in ("auto", *INTEGRATORS):
+    if solver.integrator not in ("auto", *INTEGRATORS, *smooth_methods()):
+        known = ("auto", *INTEGRATORS, *smooth_methods())
+        message = unknown("integrator", solver.integrator, known, where="this Pantograph")
+        mistakes.append(Mistake(("solver", "integrator"), message))
+    elif solver.engine == "contact" and solver.integrator not in ("auto", *INTEGRATORS):
         message = unknown("integrator", solver.integrator, ("auto", *INTEGRATORS), where="the contact engine")
         mistakes.append(Mistake(("solver", "integrator"), message))
-    if solver.tolerance is not None:
-        message = "no integrator of the contact engine is adaptive; use 'step'"
+    if solver.tolerance is not None and solver.step != "auto":
+        message = "give a tolerance (adaptive steps) or a step (fixed), not both"
         mistakes.append(Mistake(("solver", "tolerance"), message))
     if solver.step != "auto" and solver.step > scene.duration:
         message = f"a step of {solver.step:g} s is longer than the scene, {scene.duration:g} s"
@@ -137,6 +140,25 @@ def _misfits(setup: Setup) -> list[Mistake]:
         message = f'needs keys on every joint; without keys: {shown}. Use engine = "auto"'
         message = f"the kinematic engine {message}"
         mistakes.append(Mistake(("solver", "engine"), message, needs=("keys", "roles")))
+    contact_only = scene.solver.integrator in INTEGRATORS and scene.solver.integrator not in smooth_methods()
+    smooth_only = scene.solver.integrator in smooth_methods() and scene.solver.integrator not in INTEGRATORS
+    if free and engine != "kinematic":
+        reasons = why_not_smooth(setup, can_touch(setup.model))
+        if engine == "smooth" and contact_only:
+            message = unknown(
+                "integrator", scene.solver.integrator, smooth_methods(), where="the smooth engine"
+            )
+            mistakes.append(Mistake(("solver", "integrator"), message))
+        elif engine == "smooth" and reasons:
+            message = f"the smooth engine cannot run this scene: {'; '.join(reasons)}"
+            mistakes.append(Mistake(("solver", "engine"), message, needs=("physics",)))
+        elif smooth_only and reasons:
+            message = (
+                f"{scene.solver.integrator!r} belongs to the smooth engine, which cannot run this scene: "
+            )
+            mistakes.append(Mistake(("solver", "integrator"), message + "; ".join(reasons)))
+        if scene.solver.tolerance is not None and (why := _why_not_adaptive(setup, engine, reasons)):
+            mistakes.append(Mistake(("solver", "tolerance"), f"adaptive steps are not to be had here: {why}"))
     if step != "auto" and period is not None and free and not _whole(period / step):
         tries = sorted({period / max(1, np.floor(period / step)), period / np.ceil(period / step)})
         message = (
@@ -152,7 +174,7 @@ def _law(problem: Problem, scene: Scene) -> list[Mistake]:
     if scene.controller is None:
         return []
     try:
-        make_law(scene.controller.law, problem, scene.controller.parameters)
+        make_law(scene.controller.law, problem, scene.controller.parameters, scene.controller.period)
     except SceneError as e:
         return [Mistake(("controller",), str(e))]
     return []
@@ -166,14 +188,51 @@ def _whole(ratio: float) -> bool:
     return round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-6
 
 
-def _engine(setup: Setup) -> Choice:
+def why_not_smooth(setup: Setup, touch: bool) -> list[str]:
+    """Why the smooth engine cannot run a scene; empty when it can."""
+    from .dynamics.support import unsupported
+
+    m = setup.model
+    reasons = []
+    if touch:
+        reasons.append('bodies can touch (physics.contacts = "none" leaves that out)')
+    if setup.wrenches:
+        reasons.append("forces act on bodies")
+    if m.tendon_limited.any() and setup.scene.physics.limits:
+        reasons.append("tendons have limits (physics.limits = false leaves them out)")
+    fastest, step = fastest_rate(setup), setup.scene.solver.step
+    h = float(m.opt.timestep) if step == "auto" else step
+    if fastest * h > 1.0 and setup.scene.solver.tolerance is None:
+        reasons.append(
+            f"servos or springs at {fastest:.3g} rad/s are stiff for an explicit method at a step of {h:g} s"
+        )
+    return reasons + unsupported(m, keyed=np.flatnonzero(setup.roles == Role.KEYED).tolist())
+
+
+def _why_not_adaptive(setup: Setup, engine: str, reasons: list[str]) -> str:
+    if engine == "contact" or reasons:
+        return "the contact engine steps at a fixed rate; use 'step'"
+    if _period(setup) is not None or setup.servo or (setup.roles == Role.KEYED).any():
+        return "controllers, servos and keyed joints are sampled on a grid; use 'step'"
+    if setup.model.jnt_limited.any() and setup.scene.physics.limits:
+        return "joint limits are located between fixed steps; use 'step', or physics.limits = false"
+    return ""
+
+
+def _engine(setup: Setup, touch: bool) -> Choice:
     if setup.scene.solver.engine != "auto":
         return Choice(setup.scene.solver.engine, "the scene asks for it")
     free = _moved_by_physics(setup)
     if not free:
         return Choice("kinematic", "every joint is keyed, so no dynamics is needed")
     count = "one joint moves" if len(free) == 1 else f"{len(free)} joints move"
-    return Choice("contact", f"{count} by physics")
+    reasons = why_not_smooth(setup, touch)
+    integrator = setup.scene.solver.integrator
+    if integrator not in ("auto", *smooth_methods()):
+        reasons.insert(0, f"the smooth engine has no integrator {integrator!r}")
+    if not reasons:
+        return Choice("smooth", f"{count} by physics and nothing can touch: its equations are compiled")
+    return Choice("contact", f"{count} by physics; not the smooth engine, since {reasons[0]}")
 
 
 def _period(setup: Setup) -> float | None:
@@ -217,6 +276,8 @@ def _integrator(setup: Setup, engine: str, touch: bool, h: float) -> Choice:
         return Choice("none", "nothing is integrated")
     if asked != "auto":
         return Choice(asked, "the scene asks for it")
+    if setup.scene.solver.tolerance is not None:
+        return Choice("dopri5", f"adaptive, to a relative tolerance of {setup.scene.solver.tolerance:g}")
     fastest = fastest_rate(setup)
     if fastest * h > 1.0:
         return Choice("discrete", f"servos or springs at {fastest:.3g} rad/s are stiff for a step of {h:g} s")
@@ -305,13 +366,21 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
     return out
 
 
+def _other_physics(problem: Problem, engine: str) -> list[str]:
+    """Where the engine's physics, not its accuracy, differs from MuJoCo's."""
+    if engine != "smooth":
+        return []
+    from .engines.smooth import differences
+
+    return differences(problem)
+
+
 def _cheaper(setup: Setup, engine: str, integrator: str, touch: bool) -> list[str]:
     out = []
     if engine == "contact" and touch:
-        out.append(
-            'if contacts do not matter, physics.contacts = "none" saves their detection and solution, '
-            "and lets RK4 reach order 4"
-        )
+        others = why_not_smooth(setup, touch=False)
+        gain = f"but keeps the contact engine: {others[0]}" if others else "and lets the smooth engine run"
+        out.append(f'physics.contacts = "none", if contacts do not matter, saves their solution {gain}')
     if engine == "contact" and touch and integrator == "rk4":
         out.append('integrator = "discrete" needs one evaluation a step instead of four, at order 1')
     if engine == "contact" and setup.scene.solver.step != "auto":

@@ -37,9 +37,14 @@ def summary(recording: Recording) -> Table:
     table = Table(title=recording.scene.get("title") or None, show_header=False)
     simulated = float(t[-1] - t[0]) if len(t) else 0.0
     wall = float(stats["wall_s"])
-    table.add_row("engine", f"{stats['engine']}, {stats['integrator']}, step {stats['step']:.6g} s")
+    tolerance = stats.get("tolerance")
+    how = f"step {stats['step']:.6g} s" if tolerance is None else f"relative tolerance {tolerance:g}"
+    table.add_row("engine", f"{stats['engine']}, {stats['integrator']}, {how}")
     table.add_row("simulated", f"{simulated:.4g} s in {len(t)} samples ({recording.status})")
     table.add_row("wall time", f"{wall:.3g} s, {simulated / wall if wall else np.inf:.3g} times real time")
+    if "build_s" in stats:
+        found = "code found in the cache" if stats["build_cached"] else "code compiled and cached"
+        table.add_row("preparation", f"{stats['build_s']:.3g} s, {found}")
     table.add_row("evaluations", f"{stats['evaluations']}")
     if len(t):
         energy = recording.energy

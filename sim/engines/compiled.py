@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .interface import Array, Held, Problem, Role
 from .limits import Limit
@@ -61,6 +62,15 @@ class Compiled:
         nqk, nvk = len(self.q_keyed), len(self.v_keyed)
         return w[:, :nqk], w[:, nqk : nqk + nvk]
 
+    def accelerations(self, w: Array) -> Array:
+        """Accelerations of the prescribed joints in rows ``w``."""
+        nqk, nvk = len(self.q_keyed), len(self.v_keyed)
+        return w[:, nqk + nvk : nqk + 2 * nvk]
+
+    def at(self, offsets: Array) -> Array:
+        """Prescribed rows (n, nw) at times ``offsets`` (n,) [s] after the run's start."""
+        return self._rows(offsets, left=False)
+
     def on_grid(self, k: int, n: int) -> Array:
         """Prescribed rows of steps ``k`` to ``k + n`` of the run, a chunk of them evaluated at once."""
         first = k - k % CHUNK
@@ -74,10 +84,10 @@ class Compiled:
     def end(self, offset: float, on_grid: bool, k: int) -> Array:
         """The prescribed row (1, nw) at one time."""
         if on_grid and self.grid[0] <= k < self.grid[0] + 2 * CHUNK and self.grid[0] >= 0:
-            return self.grid[1][(k - self.grid[0]) * self.stepper.rows][None]
+            return np.asarray(self.grid[1][(k - self.grid[0]) * self.stepper.rows][None])
         return self._rows(np.array([offset]), left=False)
 
-    def prescribed(self, starts: Array, step: float) -> Array:
+    def prescribed(self, starts: NDArray[np.floating], step: float) -> Array:
         """Rows (n * stages, nw) for steps that begin ``starts`` (n,) seconds after the run's start, stage by
         stage; stages at a step's end take the limit from the left, where keys may bend."""
         out = np.zeros((len(starts), len(self.nodes), self.nw))
@@ -86,7 +96,7 @@ class Compiled:
                 out[:, i] = self._rows(starts + node * step, left=bool(node == 1.0))
         return out.reshape(len(starts) * len(self.nodes), self.nw)
 
-    def _rows(self, offsets: Array, *, left: bool) -> Array:
+    def _rows(self, offsets: NDArray[np.floating], *, left: bool) -> Array:
         nqk, nvk, out = len(self.q_keyed), len(self.v_keyed), np.zeros((len(offsets), self.nw))
         inputs = self.timed.at(self.t0 + offsets, left=left)
         q, v, a = out[:, :nqk], out[:, nqk : nqk + nvk], out[:, nqk + nvk : nqk + 2 * nvk]

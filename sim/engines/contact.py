@@ -35,6 +35,10 @@ class ContactEngine:
 
     name = "contact"
 
+    def order(self, integrator: str) -> int:
+        """See :class:`~pantograph.sim.engines.interface.Engine`."""
+        return ORDER[integrator]
+
     def run(
         self,
         problem: Problem,

@@ -55,16 +55,22 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
         d.ctrl[:] = segment.tick_ctrl[tick[i]] if held else 0.0
         d.ctrl[timed.servos] = inputs.ctrl[i]
         qfrc = segment.tick_qfrc[tick[i]] if held else np.zeros(m.nv)
-        apply_wrenches(p.model, d, timed, inputs.wrench[i])
-        p.settle(d, qfrc, inputs.a[i])
-        a[i], ctrl[i] = d.qacc, d.ctrl
-        tau[i] = d.qfrc_actuator + qfrc
-        tau[i, p.keyed] = p.lag
-        now, normal[i] = _active(p.model, d)
-        events += _changes(segment.t[i], touching, now)
-        touching = now
+        ctrl[i] = d.ctrl
+        if segment.a is not None and segment.drive is not None:
+            mujoco.mj_fwdPosition(m, d)
+            mujoco.mj_fwdVelocity(m, d)
+            mujoco.mj_fwdActuation(m, d)
+            a[i], tau[i] = segment.a[i], d.qfrc_actuator + qfrc + segment.drive[i]
+        else:
+            apply_wrenches(p.model, d, timed, inputs.wrench[i])
+            p.settle(d, qfrc, inputs.a[i])
+            a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
+            tau[i, p.keyed] = p.lag
+            now, normal[i] = _active(p.model, d)
+            events += _changes(segment.t[i], touching, now)
+            touching = now
         kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
-    return Derived(a, tau, ctrl, kinetic, potential, normal, tuple(events))
+    return Derived(a, tau, ctrl, kinetic, potential, normal, (*events, *segment.events))
 
 
 def apply_wrenches(model: mujoco.MjModel, data: mujoco.MjData, timed: Timed, wrench: Array) -> None:

@@ -77,7 +77,7 @@ class Problem:
     ``model`` has the scene's switches (contacts, limits, friction, gravity, idle actuators) applied.
     ``clip`` holds the motion of keyed and tracked joints; ``roles`` has one role a joint.
     ``servo`` maps an actuator driven by keys to its ctrl over time: t (n,) -> (n,).
-    ``sample_every`` steps lie between two recorded samples.
+    ``sample_every`` steps lie between two recorded samples. ``tolerance`` asks for adaptive steps.
     """
 
     model: mujoco.MjModel
@@ -91,6 +91,7 @@ class Problem:
     drives: NDArray[np.int8]
     servo: dict[int, Callable[[Array], Array]] = field(default_factory=dict)
     wrenches: tuple[Wrench, ...] = ()
+    tolerance: float | None = None
 
     @property
     def steps(self) -> int:
@@ -118,7 +119,8 @@ class Segment:
 
     t (n,), q (n, nq), v (n, nv), act (n, na); ticks hold the controller's samples: tick_t (m,),
     tick_ctrl (m, nu), tick_qfrc (m, nv). ``status`` is 'done', 'diverged' or 'interrupted';
-    ``message`` says why a run stopped early; ``events`` are those that the engine itself located.
+    ``message`` says why a run stopped early. An engine with physics of its own adds the ``events`` that it
+    located, accelerations ``a`` (n, nv), and ``drive`` (n, nv), what drives of keyed freedoms give.
     """
 
     t: Array
@@ -132,12 +134,18 @@ class Segment:
     message: str
     stats: dict[str, Any]
     events: tuple[Event, ...] = ()
+    a: Array | None = None
+    drive: Array | None = None
 
 
 class Engine(Protocol):
     """Computes motion; its inner loop is its own."""
 
     name: str
+
+    def order(self, integrator: str) -> int:
+        """Order of one of its integrators."""
+        ...
 
     def run(
         self,

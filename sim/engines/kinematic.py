@@ -16,6 +16,10 @@ class KinematicEngine:
 
     name = "kinematic"
 
+    def order(self, integrator: str) -> int:
+        """Nothing is integrated."""
+        return 0
+
     def run(
         self,
         problem: Problem,

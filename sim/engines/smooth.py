@@ -31,6 +31,17 @@ def methods() -> dict[str, int]:
     return {name: tableau.order for name, tableau in TABLEAUS.items()}
 
 
+def differences(problem: Problem) -> list[str]:
+    """Physics that this engine models otherwise than MuJoCo, as sentences; no matter of step or order."""
+    from ..dynamics.support import differences as of_model
+
+    width = friction_width(problem.model, mobility(problem), problem.step)
+    found = [f"otherwise than MuJoCo: {line}" for line in of_model(problem.model, friction_width=width)]
+    if limits_of(problem).each:
+        found.append(f"a joint that meets its limit stops there (restitution {RESTITUTION:g})")
+    return found
+
+
 def friction_width(model: mujoco.MjModel, mobility: Array, step: float) -> float | None:
     """Speed [rad/s, m/s] below which dry friction is smoothed; None without friction.
 
@@ -47,6 +58,10 @@ class SmoothEngine:
     """Runge-Kutta integration of a scene's own machine code."""
 
     name = "smooth"
+
+    def order(self, integrator: str) -> int:
+        """See :class:`~pantograph.sim.engines.interface.Engine`."""
+        return methods()[integrator]
 
     def run(
         self,
@@ -66,7 +81,8 @@ class SmoothEngine:
             )
         if problem.wrenches:
             raise EngineError("the smooth engine takes no forces on bodies; use engine = 'contact'")
-        return _Run(problem, t_span, controls, TABLEAUS[problem.integrator]).segment(progress)
+        run = _Run(problem, t_span, controls, TABLEAUS[problem.integrator])
+        return run.segment(progress) if problem.tolerance is None else run.adaptive(problem.tolerance)
 
 
 class _Run:
@@ -90,9 +106,11 @@ class _Run:
         self.q, self.v, self.act = (np.array(x, dtype=float) for x in problem.state0)
         self.held = Held(np.zeros(problem.model.nu), np.zeros(problem.model.nv))
         self.samples: list[tuple[float, State]] = []
+        self.rests: list[tuple[Limit, ...]] = []
         self.ticks: list[tuple[float, Held]] = []
         self.events: list[Event] = []
         self.evaluations = 0
+        self.build_s = 0.0
 
     @cached_property
     def width(self) -> float | None:
@@ -102,9 +120,11 @@ class _Run:
     def model(self) -> Compiled:
         """The compiled model, with the joints that rest at a limit taken out of the unknowns."""
         if self.resting not in self.compiled:
+            begun = time.perf_counter()
             self.compiled[self.resting] = Compiled(
                 self.problem, self.timed, self.t0, self.method, width=self.width, resting=self.resting
             )
+            self.build_s += time.perf_counter() - begun
         return self.compiled[self.resting]
 
     def segment(self, progress: Callable[[float], None] | None) -> Segment:
@@ -124,6 +144,33 @@ class _Run:
             status, message = "interrupted", f"interrupted at t = {self.t0 + k * self.h:.4g} s"
         return self._result(status, message, k, time.perf_counter() - started)
 
+    def adaptive(self, tolerance: float) -> Segment:
+        """The whole run with adaptive steps, to a relative tolerance (absolute: the same in SI units)."""
+        started = time.perf_counter()
+        at = np.unique(np.append(np.arange(0, self.steps, self.problem.sample_every), self.steps))
+        t = self.t0 + at * self.h
+        c = self.model()
+        path = c.smooth.integrate(
+            self.q,
+            self.v,
+            t,
+            c.held(self.held),
+            method=self.method,
+            rtol=tolerance,
+            atol=tolerance,
+            act0=self.act,
+        )
+        finite = np.isfinite(path.x).all(axis=1)
+        last = int(np.argmin(finite)) if not finite.all() else len(t)
+        self.samples = [(float(t[i]), State(path.q[i], path.v[i], path.act[i])) for i in range(last)]
+        self.rests = [()] * last
+        self.evaluations = int(path.evaluations)
+        status = "done" if last == len(t) else "diverged"
+        message = "" if status == "done" else f"no step is small enough after t = {t[last - 1]:.4g} s"
+        segment = self._result(status, message, self.steps, time.perf_counter() - started)
+        segment.stats.update(step=None, tolerance=tolerance, steps=int(path.evaluations) // c.stepper.stages)
+        return segment
+
     def _until_next(self, k: int) -> int:
         stops = [self.steps - k, CHUNK]
         if self.per_tick:
@@ -140,6 +187,7 @@ class _Run:
 
     def _keep(self, k: int, q: Array, v: Array, act: Array) -> None:
         self.samples.append((self.t0 + k * self.h, State(q.copy(), v.copy(), act.copy())))
+        self.rests.append(self.resting)
 
     def _advance(self, k: int, n: int) -> int:
         """Integrate ``n`` steps from step ``k``, or fewer when a joint meets or leaves a limit."""
@@ -283,11 +331,34 @@ class _Run:
             "try a smaller step, or check forces and initial state"
         )
 
+    def _accelerations(self, kept: list[tuple[float, State]]) -> tuple[Array, Array]:
+        """Accelerations and forces of the drives (n, nv) at the samples, those at rest apart."""
+        n, m = len(kept), self.problem.model
+        a, drive = np.zeros((n, m.nv)), np.zeros((n, m.nv))
+        t = np.array([t for t, _ in kept])
+        tick = np.searchsorted([tick for tick, _ in self.ticks], t + 1e-9, side="right") - 1
+        nothing = Held(np.zeros(m.nu), np.zeros(m.nv))
+        for resting in dict.fromkeys(self.rests[:n]):
+            at = np.array([i for i in range(n) if self.rests[i] == resting])
+            c = self.compiled[resting]
+            q, v = (rows([getattr(kept[i][1], x) for i in at], w) for x, w in (("q", m.nq), ("v", m.nv)))
+            act = rows([kept[i][1].act for i in at], m.na)
+            u = np.array([c.held(self.ticks[tick[i]][1] if tick[i] >= 0 else nothing) for i in at])
+            w = c.at(t[at] - self.t0)
+            state = {"q": q[:, c.q_free], "v": v[:, c.v_free], "act": act, "u": u, "w": w}
+            a[np.ix_(at, c.v_free)] = c.smooth.evaluate("forward", **state)["a"]
+            if len(c.v_keyed):
+                a[np.ix_(at, c.v_keyed)] = c.accelerations(w)
+                drive[np.ix_(at, c.v_keyed)] = c.smooth.evaluate("drive", **state)["drive"]
+                drive[np.ix_(at, np.array([limit.dof for limit in resting], dtype=int))] = 0.0
+        return a, drive
+
     def _result(self, status: str, message: str, k: int, wall: float) -> Segment:
         m = self.problem.model
         kept = [
             (t, s) for t, s in self.samples if np.isfinite(s.q).all() and np.abs(s.v).max(initial=0) < _HUGE
         ]
+        a, drive = self._accelerations(kept)
         builds = [c.smooth.stats for c in self.compiled.values()]
         return Segment(
             t=np.array([t for t, _ in kept]),
@@ -305,13 +376,15 @@ class _Run:
                 "step": self.h,
                 "steps": k,
                 "evaluations": self.evaluations,
-                "wall_s": wall - sum(b.seconds for b in builds),
-                "build_s": sum(b.seconds for b in builds),
+                "wall_s": wall - self.build_s,
+                "build_s": self.build_s,
                 "build_cached": all(b.cached for b in builds),
                 "friction_width": self.width,
                 "restitution": RESTITUTION if self.limits.each else None,
             },
             events=tuple(self.events),
+            a=a,
+            drive=drive,
         )
 
 

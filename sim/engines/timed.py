@@ -50,22 +50,22 @@ class Timed:
 
     def at(self, t: NDArray[np.floating], *, left: bool = False) -> TimedInputs:
         """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
-        t = np.asarray(t, dtype=np.float64)
-        n, k = len(t), len(self.keyed)
+        times: Array = np.asarray(t, dtype=np.float64)
+        n, k = len(times), len(self.keyed)
         q, v, a = np.zeros((n, len(self.qpos))), np.zeros((n, k)), np.zeros((n, k))
         if k:
-            motion = self.clip.evaluate(t, left=left)
+            motion = self.clip.evaluate(times, left=left)
             q, v, a = motion.q[:, self.qpos], motion.v[:, self.keyed], motion.a[:, self.keyed]
         ctrl = np.zeros((n, len(self.servos)))
         for i, actuator in enumerate(self.servos):
-            ctrl[:, i] = self.problem.servo[int(actuator)](t)
+            ctrl[:, i] = self.problem.servo[int(actuator)](times)
         wrench = np.zeros((n, len(self.bodies), 6))
         for i, w in enumerate(self.problem.wrenches):
-            on = ((t >= w.start) & (t < w.stop))[:, None]
+            on = ((times >= w.start) & (times < w.stop))[:, None]
             if w.force is not None:
-                wrench[:, i, :3] = np.where(on, w.force(t).q, 0.0)
+                wrench[:, i, :3] = np.where(on, w.force(times).q, 0.0)
             if w.torque is not None:
-                wrench[:, i, 3:] = np.where(on, w.torque(t).q, 0.0)
+                wrench[:, i, 3:] = np.where(on, w.torque(times).q, 0.0)
         return TimedInputs(q, v, a, ctrl, wrench)
 
 
