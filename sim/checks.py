@@ -11,7 +11,6 @@ from .engines.prescribe import prescribed_bodies
 from .kinds import HINGE, SCALAR
 from .scene.build import Setup
 
-_FRAMES = 400  # at most this many frames are searched for overlaps
 _DEEP = 1e-3  # m; shallower overlaps are within the softness of contacts
 
 
@@ -51,7 +50,7 @@ def _overlaps(setup: Setup, t: Array, q: Array) -> list[str]:
     simulated = _simulated_pairs(setup)
     data = mujoco.MjData(m)
     worst: dict[tuple[int, int], tuple[float, float]] = {}
-    for i in np.unique(np.linspace(0, len(t) - 1, min(_FRAMES, len(t))).astype(int)):
+    for i in range(len(t)):
         data.qpos[:] = q[i]
         mujoco.mj_kinematics(m, data)
         mujoco.mj_comPos(m, data)
@@ -68,10 +67,14 @@ def _overlaps(setup: Setup, t: Array, q: Array) -> list[str]:
             if left_out and contact.dist < min(-_DEEP, worst.get((b1, b2), (0.0, 0.0))[0]):
                 worst[b1, b2] = (float(contact.dist), float(t[i]))
     return [
-        f"{name_of(m, 'body', b1)} and {name_of(m, 'body', b2)} overlap by {-1e3 * depth:.3g} mm "
+        f"{name_of(m, 'body', b1)} and {name_of(m, 'body', b2)} overlap by {_length(-depth)} "
         f"at t = {when:.3g} s (contact not simulated)"
         for (b1, b2), (depth, when) in sorted(worst.items(), key=lambda item: item[1][0])
     ]
+
+
+def _length(x: float) -> str:
+    return f"{x:.3g} m" if x >= 1.0 else f"{1e3 * x:.3g} mm"
 
 
 def _simulated_pairs(setup: Setup) -> set[tuple[int, int]]:

@@ -117,6 +117,7 @@ def test_the_estimate_is_trusted_until_the_first_limit():
         duration=0.5,
         models=[{"file": "cart_pole"}],
         initial={"velocity": {"slide": 4.0}},
+        solver={"engine": "contact"},
     )
     r = run(scene, error=True)
     first = r.t[np.argmax(r.q[:, 0] > 1.0)]
@@ -138,7 +139,7 @@ def test_a_second_run_that_diverges_leaves_the_error_infinite_from_there(monkeyp
             segment = self.engine.run(problem, (t_span[0], end), controls, progress=progress)
             return dataclasses.replace(segment, status="done" if self.runs == 1 else "diverged")
 
-    plan = make_plan(Scene(duration=1.0, models=[MODELS["double_pendulum"]], physics=SMOOTH))
+    plan = make_plan(Scene(duration=1.0, models=[MODELS["double_pendulum"]], solver={"engine": "contact"}))
     engine = Diverging()
     segment = engine.run(plan.problem, (0.0, 1.0), None)
     estimate = accuracy.estimate_error(engine, plan.problem, segment, (), None)

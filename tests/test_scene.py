@@ -15,7 +15,8 @@ PENDULUM = 'duration = 1.0\n[[models]]\nfile = "pendulum"\n'
 
 
 def broken_scenes():
-    """(text, mistakes) of every block of the catalogue: lines '#: mistake', then the scene as in its file."""
+    """(text, mistakes) of every block of the catalogue: lines '#: mistake' (to be continued where it ends
+    in ...), then the scene as in its file."""
     out = []
     for path in sorted(CATALOGUE.glob("*.txt")):
         lines = path.read_text().split("\n")
@@ -41,7 +42,11 @@ def mistakes(text, **options):
 
 @pytest.mark.parametrize(("text", "says"), broken_scenes())
 def test_broken_scene_says_what_is_wrong_and_where(text, says):
-    assert mistakes(text) == says
+    found = mistakes(text)
+    for i, said in enumerate(says):
+        if said.endswith("..."):
+            found[i] = found[i][: len(said) - 3] + "..."
+    assert found == says
 
 
 def test_five_mistakes_of_different_kinds_are_reported_at_once():

@@ -1,0 +1,239 @@
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pantograph.sim import Scene, SceneError, make_plan, run
+from pantograph.sim.engines.interface import Drive, Role
+from pantograph.sim.plan import can_touch, fastest_rate
+
+PENDULUM = {"models": [{"file": "pendulum"}]}
+KEYED = {"keys": [{"joint": "hinge", "times": [0, 1], "values": [0, 1]}]}
+BALL = {"name": "ball", "shape": "sphere", "size": [0.1], "position": [0, 0, 1]}
+FLOOR = {"name": "floor", "shape": "plane", "size": [3, 3], "fixed": True}
+
+
+def plan_of(**data):
+    return make_plan(Scene(**{"duration": 1.0, **data}))
+
+
+def test_no_dynamics_where_every_joint_is_keyed():
+    plan = plan_of(**PENDULUM, **KEYED)
+    assert plan.engine.what == "kinematic"
+    assert "every joint is keyed" in plan.engine.why
+    assert plan.integrator.what == "none"
+    assert any(line.startswith("all dynamics") for line in plan.left_out)
+    assert plan_of(props=[BALL, FLOOR]).engine.what == "contact"
+    assert plan_of(**PENDULUM, **KEYED, solver={"engine": "contact"}).engine.what == "contact"
+    assert "the scene asks" in plan_of(**PENDULUM, **KEYED, solver={"engine": "kinematic"}).engine.why
+
+
+def test_every_joint_and_actuator_is_listed_under_what_moves_it():
+    plan = plan_of(
+        models=[{"file": "arm6"}],
+        roles={"tracked": ["elbow", "wrist_*"]},
+        keys=[{"joint": "waist", "times": [0], "values": [0]}],
+        actuators={"shoulder": "keys"},
+        controller={"law": "pd"},
+    )
+    assert plan.joints(Role.KEYED) == ("waist",)
+    assert plan.joints(Role.TRACKED) == ("elbow", "wrist_pitch")
+    assert plan.joints(Role.PASSIVE) == ("shoulder", "forearm_roll", "tool_roll")
+    assert plan.actuators(Drive.KEYS) == ("shoulder",)
+    assert plan.actuators(Drive.CONTROLLER) == ("elbow", "wrist_pitch")
+    (idle,) = [line for line in plan.left_out if line.startswith("actuators that nothing drives")]
+    assert idle == "actuators that nothing drives: waist, forearm_roll, tool_roll"
+
+
+periods = st.floats(1e-3, 0.05)
+
+
+@given(periods, st.floats(0.03, 2.0))
+@settings(max_examples=40)
+def test_the_step_of_a_controlled_scene_divides_its_period(period, duration):
+    plan = plan_of(duration=duration, roles={"tracked": ["hinge"]}, controller={"period": period}, **PENDULUM)
+    h, own = plan.problem.step, 0.002
+    assert plan.period == period
+    assert period / h == pytest.approx(round(period / h), abs=1e-6)
+    assert h <= own * (1 + 1e-6)
+    assert h > own / 2 or h == pytest.approx(period)
+    assert abs(plan.problem.steps * h - duration) <= h / 2
+
+
+@given(st.floats(1e-4, 1.0))
+@settings(max_examples=40)
+def test_a_run_lasts_as_long_as_the_scene_says(duration):
+    for scene in (Scene(duration=duration, **PENDULUM), Scene(duration=duration, **PENDULUM, **KEYED)):
+        r = run(scene)
+        assert r.t[0] == 0
+        assert r.t[-1] == pytest.approx(duration, rel=1e-9)
+        assert np.all(np.diff(r.t) > 0)
+
+
+def test_a_step_that_the_scene_asks_for_is_taken_and_its_end_told():
+    plan = plan_of(**PENDULUM, solver={"step": 0.3})
+    assert plan.problem.step == 0.3
+    assert "the run ends after whole steps, at 0.9 s" in plan.step.why
+    assert run(plan).t[-1] == pytest.approx(0.9)
+    assert plan_of(**PENDULUM, solver={"step": 0.25}).step.why == "the scene asks for it"
+    exact = plan_of(
+        **PENDULUM, roles={"tracked": ["hinge"]}, controller={"period": 0.003}, solver={"step": 1e-3}
+    )
+    assert exact.problem.step == 1e-3
+
+
+@given(st.floats(1e-3, 0.1), st.floats(1e-3, 0.1))
+@settings(max_examples=60)
+def test_a_period_that_is_no_multiple_of_the_step_is_refused_with_both_and_what_would_do(period, step):
+    data = {"roles": {"tracked": ["hinge"]}, **PENDULUM}
+    scene = Scene(duration=1, controller={"period": period}, solver={"step": step}, **data)
+    ratio = period / step
+    if ratio > 0.5 and abs(ratio - round(ratio)) <= 1e-6:
+        assert make_plan(scene).problem.step == step
+        return
+    with pytest.raises(SceneError, match=r"controller\.period: the controller's period") as error:
+        make_plan(scene)
+    text = str(error.value)
+    assert f"{period:g} s" in text
+    assert f"{step:g} s" in text
+    for h in text.split("try a step of ")[1].replace(" s", "").split(" or "):
+        ratio = period / float(h)
+        assert ratio == pytest.approx(round(ratio), rel=1e-5)
+
+
+def test_samples_are_as_many_as_asked_rounded_to_whole_steps():
+    r = run(Scene(duration=1.0, rate=50, **PENDULUM))
+    np.testing.assert_allclose(r.t, np.arange(51) * 0.02, atol=1e-12)
+    assert len(run(Scene(duration=1.0, rate=1e6, **PENDULUM)).t) == 501
+
+
+def spring_scene(tmp_path, joint, actuator="", **data):
+    path = tmp_path / "spring.xml"
+    path.write_text(
+        f'<mujoco><option timestep="0.01"/><worldbody><body><joint name="x" type="slide" {joint}/>'
+        f'<geom size="0.1" mass="4"/></body></worldbody><actuator>{actuator}</actuator></mujoco>'
+    )
+    return Scene(duration=1.0, models=[{"file": str(path)}], **data)
+
+
+def test_the_fastest_rate_is_that_of_the_stiffest_spring_damper_or_servo(tmp_path):
+    def rate(*args, **data):
+        return fastest_rate(make_plan(spring_scene(tmp_path, *args, **data)).setup)
+
+    assert rate("") == 0
+    assert rate('stiffness="400"') == pytest.approx(10)
+    assert rate('damping="8"') == pytest.approx(2)
+    servo = '<position joint="x" kp="100" gear="3"/>'
+    assert rate("", servo) == 0  # nothing drives it
+    assert rate("", servo, roles={"tracked": ["x"]}) == pytest.approx(15)
+    keyed = [{"joint": "x", "times": [0], "values": [0]}]
+    assert rate('stiffness="400"', keys=keyed) == 0
+
+
+def test_stiff_scenes_get_the_integrator_for_them(tmp_path):
+    stiff, soft = (make_plan(spring_scene(tmp_path, f'stiffness="{k}"')) for k in ("1e6", "100"))
+    assert stiff.integrator.what == "discrete"
+    assert "stiff" in stiff.integrator.why
+    assert soft.integrator.what == "rk4"
+    assert run(stiff).status == "done"
+    assert (
+        plan_of(**PENDULUM, solver={"integrator": "euler", "engine": "contact"}).problem.integrator == "euler"
+    )
+
+
+@st.composite
+def piles(draw):
+    """Trees of spheres that all overlap, with random collision masks, exclusions and pairs."""
+    bits = st.sampled_from([(0, 0), (1, 1), (1, 0), (0, 1), (2, 1)])
+    spec = mujoco.MjSpec()
+    bodies = [spec.worldbody]
+    if draw(st.booleans()):
+        a, b = draw(bits)
+        spec.worldbody.add_geom(name="g0", size=[9, 0, 0], contype=a, conaffinity=b)
+    for i in range(1, draw(st.integers(2, 5))):
+        body = bodies[draw(st.integers(0, len(bodies) - 1))].add_body(name=f"b{i}")
+        if draw(st.booleans()):
+            body.add_joint(name=f"j{i}")
+        a, b = draw(bits)
+        body.add_geom(name=f"g{i}", size=[9, 0, 0], pos=[0, 0, 0.1 * i], contype=a, conaffinity=b)
+        bodies.append(body)
+    for x, y in itertools.combinations(range(1, len(bodies)), 2):
+        if draw(st.integers(0, 3)) == 0:
+            spec.add_exclude(bodyname1=f"b{x}", bodyname2=f"b{y}")
+        if draw(st.integers(0, 9)) == 0:
+            spec.add_pair(geomname1=f"g{x}", geomname2=f"g{y}")
+    if draw(st.integers(0, 5)) == 0:
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    return spec.compile()
+
+
+@given(piles())
+@settings(max_examples=200)
+def test_what_could_touch_is_what_mujoco_lets_touch(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert can_touch(model) == (data.ncon > 0)
+
+
+def test_what_is_left_out_is_told_with_its_reason():
+    def told(*words, **physics):
+        plan = plan_of(models=[{"file": "cart_pole"}], physics=physics)
+        return [any(line.startswith(word) for line in plan.left_out) for word in words]
+
+    words = ("contacts", "joint limits", "dry friction", "gravity")
+    assert told(*words) == [False, False, False, False]
+    assert told(*words, contacts="none") == [True, False, False, False]
+    assert told(*words, contacts=[]) == [True, False, False, False]
+    assert told(*words, limits=False) == [False, True, False, False]
+    assert told(*words, friction=False) == [False, False, True, False]
+    assert told(*words, gravity=False) == [False, False, False, True]
+    assert told(*words, gravity=[0, 0, -1.6]) == [False, False, False, False]
+
+
+def test_a_controller_with_nothing_to_control_is_told():
+    def told(**data):
+        plan = plan_of(**PENDULUM, controller={"law": "pd"}, **data)
+        return any(line.startswith("the controller") for line in plan.left_out), plan.period
+
+    assert told() == (True, None)
+    assert told(roles={"tracked": ["hinge"]}) == (False, 0.002)
+    assert plan_of(**PENDULUM, roles={"tracked": ["hinge"]}).period == 0.002
+
+
+def test_what_would_be_cheaper_is_told_where_it_would():
+    def cheaper(**data):
+        return " | ".join(plan_of(**data).cheaper)
+
+    touching = cheaper(props=[BALL, FLOOR])
+    assert 'physics.contacts = "none"' in touching
+    assert "discrete" in touching
+    assert cheaper(props=[BALL]) == ""
+    assert cheaper(props=[BALL, FLOOR], physics={"contacts": "none"}) == ""
+    assert "2 times less" in cheaper(**PENDULUM, solver={"step": 0.001, "engine": "contact"})
+
+
+def test_joints_tied_to_keyed_ones_follow_them(tmp_path):
+    path = tmp_path / "tied.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/></body>'
+        '<body pos="1 0 0"><joint name="b"/><geom size="0.1"/></body></worldbody>'
+        '<equality><joint joint1="b" joint2="a" polycoef="0.1 2 0 0 0"/></equality></mujoco>'
+    )
+    keys = [{"joint": "a", "times": [0, 1], "values": [0, 1], "curve": "linear"}]
+    plan = plan_of(models=[{"file": str(path)}], keys=keys)
+    assert plan.setup.coupled == ("b",)
+    assert plan.engine.what == "kinematic"
+    r = run(plan)
+    np.testing.assert_allclose(r.q[:, 1], 0.1 + 2 * r.t, atol=1e-12)
+
+
+def test_switches_leave_the_model_as_filed_alone():
+    plan = plan_of(
+        models=[{"file": "cart_pole"}], physics={"contacts": "none", "limits": False, "gravity": False}
+    )
+    flags = mujoco.mjtDisableBit
+    expected = flags.mjDSBL_CONTACT | flags.mjDSBL_LIMIT | flags.mjDSBL_GRAVITY
+    assert plan.problem.model.opt.disableflags & expected == expected
+    assert plan.setup.as_filed.opt.disableflags & expected == 0
