@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def connect(
     name = port or rig.port
     if bus is None and name == VIRTUAL:
         bus = virtual_bus(rig, pose=pose)
-    if bus is None and not Path(name).exists():
+    if bus is None and os.name == "posix" and not Path(name).exists():
         from .ports import serial_devices
 
         here = ", ".join(serial_devices()) or "none"

@@ -8,7 +8,7 @@ tau_q = (A g')^T tau_s  (virtual work); the servo torques of least norm share a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.naming import lookup
-from .rig import JointItem, Rig, RigError
+from .rig import JointItem, Rig
 from .virtual.motor import MOTORS
 
 Array = NDArray[np.float64]
@@ -261,7 +261,7 @@ def joint_bounds(rig: Rig, model: mujoco.MjModel | None = None) -> JointBounds:
         unit = 1.0 if item.crank or item.points else rig.unit
         low, high = (-np.inf, np.inf) if item.range is None else (r * unit for r in item.range)
         if item.range is None and model is not None:
-            index = lookup(model, "joint", item.joint)
+            index = lookup(model, "joint", rig.joint_in(model, item.joint))
             if model.jnt_limited[index]:
                 low, high = (float(x) for x in model.jnt_range[index])
         rate = [x * unit if x else np.inf for x in (item.velocity, item.acceleration)]
@@ -277,10 +277,30 @@ def park_pose(rig: Rig, start: Array) -> Array:
     )
 
 
-def indices(mapping: Mapping, model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Places of the rig's joints in qpos and in qvel; RigError for one that the model lacks."""
-    try:
-        joints = [lookup(model, "joint", n) for n in mapping.joints]
-    except Exception as e:
-        raise RigError(str(e)) from None
+def within_joints(servos: Bounds, mapping: Mapping, joints: JointBounds) -> Bounds:
+    """Limits of the servos that also keep each joint's range and speed: what a single goal can be held to."""
+    low, high = joints.low.copy(), joints.high.copy()
+    speed = joints.velocity.copy()
+    for j, curve in mapping.curves.items():
+        if np.isfinite(high[j] - low[j]):
+            u, slope, _ = curve.angle(np.linspace(low[j], high[j], 257))
+            low[j], high[j] = u.min(), u.max()
+            speed[j] *= np.abs(slope).max()
+        else:
+            low[j], high[j], speed[j] = -np.inf, np.inf, np.inf
+    used = mapping.matrix != 0
+    with np.errstate(invalid="ignore"):
+        ends = np.stack([mapping.matrix * low, mapping.matrix * high])
+        fast = np.abs(mapping.matrix) * speed
+    return replace(
+        servos,
+        low=np.maximum(servos.low, mapping.zero + np.where(used, ends.min(axis=0), 0.0).sum(axis=1)),
+        high=np.minimum(servos.high, mapping.zero + np.where(used, ends.max(axis=0), 0.0).sum(axis=1)),
+        velocity=np.minimum(servos.velocity, np.where(used, fast, 0.0).sum(axis=1)),
+    )
+
+
+def indices(rig: Rig, mapping: Mapping, model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Places of the rig's joints in qpos and in qvel; ModelError for one that the model lacks."""
+    joints = [lookup(model, "joint", rig.joint_in(model, n)) for n in mapping.joints]
     return model.jnt_qposadr[joints].astype(np.intp), model.jnt_dofadr[joints].astype(np.intp)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..sim.recording import Recording
 from .mapping import Mapping, indices
+from .rig import Rig
 
 Array = NDArray[np.float64]
 _BEND = 0.2  # relative difference of velocities at which a sample is a bend
@@ -86,9 +87,9 @@ class Motion:
         return np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * steps).ravel(), self.t[-1])
 
 
-def motion_of(recording: Recording, mapping: Mapping) -> Motion:
-    """The rig's joints of a recording; RigError for a joint that its model lacks."""
-    qpos, dofs = indices(mapping, recording.model)
+def motion_of(recording: Recording, rig: Rig, mapping: Mapping) -> Motion:
+    """The rig's joints of a recording; ModelError for a joint that its model lacks."""
+    qpos, dofs = indices(rig, mapping, recording.model)
     keep = np.concatenate([[True], np.diff(recording.t) > 0])
     t = np.asarray(recording.t[keep], dtype=float)
     q, v, a = recording.q[keep][:, qpos], recording.v[keep][:, dofs], recording.a[keep][:, dofs]
@@ -98,13 +99,13 @@ def motion_of(recording: Recording, mapping: Mapping) -> Motion:
     return Motion(t, q, v, a)
 
 
-def loads_of(recording: Recording, mapping: Mapping) -> Loads:
+def loads_of(recording: Recording, rig: Rig, mapping: Mapping) -> Loads:
     """Joint forces of a recording, by inverse dynamics of its model without contacts and constraints.
 
     A motion with contacts is taken as recorded, as if slowing did not relieve it.
     """
     model = recording.model
-    _, dofs = indices(mapping, model)
+    _, dofs = indices(rig, mapping, model)
     keep = np.concatenate([[True], np.diff(recording.t) > 0])
     if np.any(recording.normal > 0):
         recorded = recording.tau[keep][:, dofs]

@@ -150,6 +150,7 @@ class Rig(Item):
     model: str | None = Field(
         None, description="the robot that it embodies, for calibration and teleoperation"
     )
+    prefix: str = Field("", description="name of the model in a scene of several: joints are 'prefix/joint'")
     angle: Literal["radian", "degree"] = "radian"
     port: str = Field(VIRTUAL, description=f"serial device, or {VIRTUAL!r} for virtual servos in memory")
     baud: int = Field(1_000_000, description="bit rate")
@@ -195,6 +196,21 @@ class Rig(Item):
         """Joints that a servo moves."""
         found = [j.joint for j in self.joints if any(d.servo == servo for d in j.drives)]
         return found + [j for d in self.differentials if servo in d.servos for j in d.joints]
+
+    def joint_in(self, model: mujoco.MjModel, joint: str) -> str:
+        """Name of a rig's joint in a model: its own, with the prefix, or the only one 'anything/joint'."""
+        names = joint_names(model)
+        if self.prefix:
+            return f"{self.prefix}/{joint}"
+        if joint in names:
+            return joint
+        inside = [n for n in names if n.endswith(f"/{joint}")]
+        if len(inside) > 1:
+            raise RigError(
+                f"{self._file}: the scene has several joints {joint!r}: {', '.join(inside)}; "
+                f"say which model the rig is, with a line such as: prefix = "{inside[0].rsplit("/", 1)[0]}"'
+            )
+        return inside[0] if inside else joint
 
     def label(self, id: int) -> str:
         """A servo for messages: ID, name and joint."""
@@ -358,12 +374,11 @@ def check_model(rig: Rig, model: mujoco.MjModel) -> None:
     mistakes = []
     names = joint_names(model)
     for i, item in enumerate(rig.joints):
-        if item.joint not in names:
-            mistakes.append(
-                Mistake(("joints", i, "joint"), unknown("joint", item.joint, names, where="the model"))
-            )
+        name = rig.joint_in(model, item.joint)
+        if name not in names:
+            mistakes.append(Mistake(("joints", i, "joint"), unknown("joint", name, names, where="the model")))
             continue
-        index = names.index(item.joint)
+        index = names.index(name)
         kind = mujoco.mjtJoint(int(model.jnt_type[index]))
         slide = kind == mujoco.mjtJoint.mjJNT_SLIDE
         if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):

@@ -179,6 +179,7 @@ def test_every_mismatch_with_the_rig_is_told_at_once() -> None:
         VirtualServo("xm430-w350", 2, baud=rig.baud, supply=9.0, ambient=78.0),
     ]
     servos[1].memory.put("torque_enable", 1)
+    servos[1].memory.put("min_position_limit", 2048 - 652)
     outcome = session_of(rig, VirtualBus(servos)).run(np.zeros(3), lambda t: None, 1.0)
     assert outcome.status == "fault" and outcome.phase == "scan"
     for words in (
@@ -186,6 +187,7 @@ def test_every_mismatch_with_the_rig_is_told_at_once() -> None:
         "servo 2 'right' (joint elbow) has its torque on already",
         "servo 2 'right' (joint elbow) has 9.0 V",
         "servo 2 'right' (joint elbow) has 78 degC",
+        "servo 2 'right' (joint elbow) has position limits of -1.000 to 3.140 rad",
         "servo 3 'tip' (joint wrist) does not answer",
     ):
         assert words in outcome.message

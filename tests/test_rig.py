@@ -20,6 +20,7 @@ from pantograph.hardware.mapping import (
     make_bounds,
     make_mapping,
     park_pose,
+    within_joints,
 )
 from pantograph.hardware.motion import Loads, Motion, loads_of, motion_of
 from pantograph.hardware.rig import RigError, check_model, load_rig, parse_rig
@@ -224,6 +225,37 @@ def test_limits_come_from_the_file_or_from_the_model_of_servo() -> None:
     )
 
 
+@given(st.integers(0, 2**32 - 1))
+def test_goals_within_the_servos_tightened_limits_hold_every_pose_of_the_joints(seed: int) -> None:
+    rig = parse_rig(EVERYTHING)
+    mapping, joints = make_mapping(rig), joint_bounds(rig)
+    free = make_bounds(rig)
+    tight = within_joints(free, mapping, joints)
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(np.fmax(joints.low, -1), np.fmin(joints.high, 1), (50, 5))
+    s = np.clip(mapping.servo(q), free.low, free.high)
+    assert (s > tight.low - 1e-9).all() and (s < tight.high + 1e-9).all()
+    ends = mapping.servo(np.array([[0.0, 0.0, 0.0, x, 0.5] for x in (0.015, 0.037)]))[:, 4]
+    assert np.allclose(sorted(ends), [tight.low[4], tight.high[4]])
+    assert (tight.velocity <= free.velocity).all()
+
+
+def test_joints_of_a_named_model_in_a_scene() -> None:
+    body = '<body name="b{0}"><joint name="{0}/elbow"/><geom size=".1"/></body>'
+    one, two = (
+        mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{''.join(map(body.format, names))}</worldbody></mujoco>"
+        )
+        for names in (["left"], ["left", "right"])
+    )
+    text = 'servos = [{ name = "s", id = 1, model = "mx-28" }]\n[[joints]]\njoint = "elbow"\nservo = "s"'
+    rig = parse_rig(text)
+    assert rig.joint_in(one, "elbow") == "left/elbow"
+    with pytest.raises(RigError, match="several joints 'elbow': left/elbow, right/elbow"):
+        check_model(rig, two)
+    assert parse_rig('prefix = "right"\n' + text).joint_in(two, "elbow") == "right/elbow"
+
+
 # The verdict.
 
 ONE = Mapping(("j",), ("s",), (1,), np.array([[2.0]]), np.zeros(1), {})
@@ -346,7 +378,8 @@ def test_loads_split_as_a_pendulum_does() -> None:
         <inertial pos="0 0 {-rod}" mass="{m}" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>"""
     mapping = Mapping(("j",), ("s",), (1,), np.eye(1), np.zeros(1), {})
     recording = _pendulum_recording(model)
-    motion, loads = motion_of(recording, mapping), loads_of(recording, mapping)
+    rig = parse_rig('servos = [{name="s", id=1, model="mx-28"}]\n[[joints]]\njoint = "j"\nservo = "s"')
+    motion, loads = motion_of(recording, rig, mapping), loads_of(recording, rig, mapping)
     q, v, a = motion.q, motion.v, motion.a
     assert np.allclose(loads.static, m * 9.81 * rod * np.sin(q) + friction * np.sign(v), atol=1e-6)
     assert np.allclose(loads.viscous, d * v)

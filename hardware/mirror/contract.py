@@ -16,6 +16,7 @@ from ..driver import Block, Driver, Found, NoAnswer, Refused
 from ..errors import BusError, HardwareError
 from ..mapping import Bounds, Mapping
 from ..rig import Rig
+from ..tables.rows import POSITION
 
 Array = NDArray[np.float64]
 Phase = Literal["scan", "prepare", "torque on", "ramp", "stream", "stop"]
@@ -64,8 +65,11 @@ def error_names(bits: int) -> str:
     return " and ".join(names) or f"unknown error {bits:#04x}"
 
 
-def scan(driver: Driver, rig: Rig, *, take_over: bool = False) -> bool:
-    """Whether torque is on; RigFault with every mismatch between the rig file and the servos found."""
+def scan(driver: Driver, rig: Rig, bounds: Bounds | None, *, take_over: bool = False) -> bool:
+    """Whether torque is on; RigFault with every mismatch between the rig file and the servos found.
+
+    With `bounds`, position limits of the servos that are narrower are mismatches too.
+    """
     wrong: list[tuple[int, str]] = []
     on = []
     for item in rig.servos:
@@ -73,6 +77,8 @@ def scan(driver: Driver, rig: Rig, *, take_over: bool = False) -> bool:
         try:
             found = driver.ping(id)
             wrong += [(id, text) for text in _mismatches(driver, rig, id, found, take_over)]
+            if found.table is not None and bounds is not None:
+                wrong += [(id, text) for text in _too_narrow(driver, rig, id, bounds)]
             if found.table is not None and driver.read_raw(id, "torque_enable"):
                 on.append(id)
         except (NoAnswer, Refused) as e:
@@ -106,6 +112,17 @@ def _mismatches(driver: Driver, rig: Rig, id: int, found: Found, take_over: bool
     if driver.read_raw(id, "secondary_id") in rig.ids:
         shadow = driver.read_raw(id, "secondary_id")
         yield f"{label} has the secondary ID {shadow}, which is {rig.label(shadow)}; set it to 255"
+
+
+def _too_narrow(driver: Driver, rig: Rig, id: int, bounds: Bounds) -> Iterable[str]:
+    """Goals beyond a servo's own limits are refused without an answer: better to know before."""
+    i = rig.ids.index(id)
+    low, high = (driver.read(id, n) for n in ("min_position_limit", "max_position_limit"))
+    if low > bounds.low[i] + POSITION or high < bounds.high[i] - POSITION:
+        yield (
+            f"{rig.label(id)} has position limits of {low:.3f} to {high:.3f} rad, the rig file asks for "
+            f"{bounds.low[i]:.3f} to {bounds.high[i]:.3f}: narrow the range there, or widen the limits"
+        )
 
 
 def prepare(driver: Driver, rig: Rig, mapping: Mapping, bounds: Bounds, *, torque: bool) -> Ready:

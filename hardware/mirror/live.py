@@ -23,6 +23,7 @@ from ...sim.scene.schema import Scene
 from ..errors import HardwareError
 from ..mapping import Mapping, indices
 from ..motion import Motion
+from ..rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -45,11 +46,13 @@ class Live:
 
     Args:
         scene: What runs.
-        mapping: The rig's joints.
+        rig, mapping: The rig and its joints.
         patient: Wait for the simulation when it is late (virtual time); else hold and count.
     """
 
-    def __init__(self, scene: Scene | Plan | str | Path, mapping: Mapping, *, patient: bool) -> None:
+    def __init__(
+        self, scene: Scene | Plan | str | Path, rig: Rig, mapping: Mapping, *, patient: bool
+    ) -> None:
         if isinstance(scene, str | Path):
             scene = load_scene(scene)
         plan = scene if isinstance(scene, Plan) else make_plan(scene)
@@ -60,7 +63,7 @@ class Live:
         self.scene: dict[str, Any] = base.model_dump(mode="json", exclude_defaults=True)
         self.patient = patient
         self.starved = 0  # targets that the simulation had not computed in time
-        self._qpos, self._dofs = indices(mapping, self.model)
+        self._qpos, self._dofs = indices(rig, mapping, self.model)
         self._engine = make_engine(plan.engine.what)
         self._controls: Controls | None = None
         if plan.period is not None:

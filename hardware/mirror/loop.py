@@ -29,7 +29,7 @@ _HOT = 2.0  # K below the temperature limit at which the rig stops, before the s
 class Log:
     """What every cycle did: lists of the same length, times [s] of the bus clock, goals [rad].
 
-    feedback: counts of the feedback block, a row for each servo, NaN for one that did not answer.
+    feedback: counts of the feedback block (ns, registers), NaN for a servo that did not answer.
     """
 
     due: list[float] = field(default_factory=list)
@@ -37,7 +37,7 @@ class Log:
     ended: list[float] = field(default_factory=list)
     phase: list[Phase] = field(default_factory=list)
     goal: list[Array] = field(default_factory=list)
-    feedback: list[Rows] = field(default_factory=list)
+    feedback: list[Array] = field(default_factory=list)
     skipped: int = 0  # cycles that were due while another was still under way
     clamped: int = 0  # goals that software limits changed
     lost_goals: int = 0  # goals sent that a servo was seen not to have
@@ -120,7 +120,7 @@ class Loop:
         log.ended.append(driver.clock.now())
         log.phase.append(phase)
         log.goal.append(goal)
-        log.feedback.append(rows)
+        log.feedback.append(np.array(rows, dtype=float))
         self._judge(rows, counts, phase)
         if driver.clock.now() >= self._health_due and due + self.period - driver.clock.now() > self._cost:
             self._look_at_health(phase)

@@ -30,8 +30,8 @@ def judge(recording: Recording, rig: Rig) -> tuple[Motion, Verdict]:
     model = recording.model
     check_model(rig, model)
     mapping = make_mapping(rig)
-    motion = motion_of(recording, mapping)
-    loads = loads_of(recording, mapping)
+    motion = motion_of(recording, rig, mapping)
+    loads = loads_of(recording, rig, mapping)
     return motion, check_motion(motion, mapping, make_bounds(rig), joint_bounds(rig, model), loads)
 
 
@@ -61,7 +61,9 @@ def mirror_recording(
     motion = fit(motion, verdict, slow=slow)
     driver, note = connect(rig, port=port, bus=bus, paced=paced)
     try:
-        session = Session(rig, driver, stop=stop, take_over=take_over, on_phase=on_phase)
+        session = Session(
+            rig, driver, stop=stop, take_over=take_over, on_phase=on_phase, model=recording.model
+        )
         mapping, begin = session.mapping, float(motion.t[0])
 
         def target(t: float) -> Array:
@@ -111,11 +113,13 @@ def mirror_live(
     rig = load_rig(rig) if isinstance(rig, str | Path) else rig
     mapping = make_mapping(rig)
     virtual = bus is not None or (port or rig.port) == VIRTUAL
-    with Live(scene, mapping, patient=virtual and not paced) as live:
+    with Live(scene, rig, mapping, patient=virtual and not paced) as live:
         check_model(rig, live.model)
         driver, note = connect(rig, port=port, bus=bus, paced=paced)
         try:
-            session = Session(rig, driver, stop=stop, take_over=take_over, on_phase=on_phase)
+            session = Session(
+                rig, driver, stop=stop, take_over=take_over, on_phase=on_phase, model=live.model
+            )
 
             def target(t: float) -> Array | None:
                 if progress:

@@ -243,7 +243,7 @@ def _recording(
     others: Callable[[Array], Array] | None,
     scene: dict[str, Any],
 ) -> Recording:
-    qpos, dofs = indices(mapping, model)
+    qpos, dofs = indices(rig, mapping, model)
     filled = np.stack([np.interp(t, t[np.isfinite(x)], x[np.isfinite(x)]) for x in measured.T], axis=1)
     q = np.tile(model.qpos0, (len(t), 1)) if others is None else np.array(others(t))
     q[:, qpos] = filled

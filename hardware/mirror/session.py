@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..driver import Driver, NoAnswer, Refused
 from ..errors import BusError
-from ..mapping import Mapping, make_bounds, make_mapping, park_pose
+from ..mapping import Mapping, joint_bounds, make_bounds, make_mapping, park_pose, within_joints
 from ..rig import Rig, RigError, Stop
 from .contract import Phase, Ready, RigFault, freeze, prepare, release, scan, torque_on
 from .loop import Log, Loop
@@ -47,6 +48,7 @@ class Session:
         stop: How it ends: 'hold' (torque stays on), 'park' (to the park pose, then limp) or 'limp'.
         take_over: Accept servos whose torque is on.
         on_phase: Told each phase as it begins.
+        model: For ranges of joints that the rig file leaves to it.
     """
 
     def __init__(
@@ -57,10 +59,11 @@ class Session:
         stop: Stop = "hold",
         take_over: bool = False,
         on_phase: Callable[[Phase], None] | None = None,
+        model: mujoco.MjModel | None = None,
     ) -> None:
         self.rig, self.driver, self.stop_how, self.take_over = rig, driver, stop, take_over
         self.mapping: Mapping = make_mapping(rig)
-        self.bounds = make_bounds(rig)
+        self.bounds = within_joints(make_bounds(rig), self.mapping, joint_bounds(rig, model))
         self.outcome = Outcome()
         self._on_phase = on_phase
         self._loop: Loop | None = None
@@ -125,7 +128,7 @@ class Session:
         """Everything before the first goal that moves something."""
         rig, driver, out = self.rig, self.driver, self.outcome
         self._phase("scan")
-        held = scan(driver, rig, take_over=self.take_over)
+        held = scan(driver, rig, self.bounds, take_over=self.take_over)
         self._phase("prepare")
         out.ready = prepare(driver, rig, self.mapping, self.bounds, torque=held)
         cost = driver.cycle_time(out.ready.block)

@@ -29,7 +29,7 @@ class Leader:
 
     def __init__(self, rig: Rig, driver: Driver) -> None:
         self.rig, self.driver, self.mapping = rig, driver, make_mapping(rig)
-        scan(driver, rig)  # refuses torque: a rig that holds itself would have to be dropped
+        scan(driver, rig, None)  # refuses torque: a rig that holds itself would have to be dropped
         for id in rig.ids:
             driver.return_delay[id] = driver.read(id, "return_delay_time")
         self._block = driver.block(rig.ids, _FEEDBACK)
@@ -153,9 +153,10 @@ def _lead(
             f"follower: {', '.join(mapping.joints)}"
         )
     to, of = (list(x) for x in zip(*pairs, strict=True))
-    bounds = joint_bounds(follower, follower.load_model() if follower.model else None)
+    model = follower.load_model() if follower.model else None
+    bounds = joint_bounds(follower, model)
     driver, note = connect(follower, port=port, bus=bus, paced=paced)
-    session = Session(follower, driver, stop=stop)
+    session = Session(follower, driver, stop=stop, model=model)
     goal = np.zeros(len(mapping.joints))
 
     def first(present: Array) -> Array:
@@ -178,7 +179,6 @@ def _lead(
         outcome = session.run(first, target, duration)
     finally:
         driver.close()
-    model = follower.load_model() if follower.model else None
     return make_report(outcome, follower, driver, mapping, notes=(note,), model=model)
 
 
@@ -190,6 +190,6 @@ def _recording(rig: Rig, driver: Driver, t: Array, q: Array) -> Recording | None
     log = Log(due=list(t), begun=list(t), ended=list(t), phase=["stream"] * len(t), goal=list(s))
     rest = np.zeros((s.shape[1], len(FEEDBACK) - 2))
     # In SI already: no servo block was prepared for an outcome without `ready`.
-    log.feedback = [list(map(tuple, np.column_stack([a, b, rest]))) for a, b in zip(s, speed, strict=True)]
+    log.feedback = [np.column_stack([a, b, rest]) for a, b in zip(s, speed, strict=True)]
     outcome = Outcome(stop="limp: it never had torque", log=log)
     return make_report(outcome, rig, driver, mapping, model=rig.load_model()).recording

@@ -274,7 +274,8 @@ def losses(console: Console) -> list[Figure]:
     console.print(
         f"{len(log.goal):,} cycles, {bus.dice.count['lost']:,} packets lost: {len(truth.lost_goals)} goals "
         f"({visible} visible, {log.lost_goals} seen), {truth.lost_answers} questions and answers "
-        f"({seen.lost} seen); oldest goal {log.oldest_goal} cycles, farthest behind a goal {lag:.3f} rad, {outcome.status}"
+        f"({seen.lost} seen); oldest goal {log.oldest_goal} cycles, farthest behind a goal {lag:.3f} rad, "
+        f"{outcome.status}"
     )
     finished, lost = outcome.status == "done", bus.dice.count["lost"]
     least = round(100 * MINUTES)
