@@ -31,6 +31,9 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'p
 
 def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
+    from ...hardware.cli import app as servo
+
+    app.add_typer(servo)
     try:
         app()
     except PantographError as e:
@@ -133,6 +136,31 @@ def models(name: Annotated[str | None, typer.Argument(help="A model to describe.
         show.models(console, names())
     else:
         show.model(console, name)
+
+
+@app.command(epilog="Examples: pantograph report wave.toml; pantograph report --suite hard")
+def report(
+    scene: Annotated[Path | None, typer.Argument(help="Scene file (TOML).")] = None,
+    suite: Annotated[str | None, typer.Option(help="A suite of cases with known ends: 'hard'.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for tables (CSV, JSON, text) and figures.")] = Path("out"),
+) -> None:
+    """Error against cost: engines and methods over steps and tolerances, with a recommendation."""
+    from ..report import hard_suite
+    from ..report import report as compare
+
+    if (scene is None) == (suite is None):
+        raise PantographError("give a scene file, or --suite hard")
+    if suite not in (None, "hard"):
+        raise PantographError(f"there is no suite {suite!r}; there is: hard")
+    with show.status("comparing methods") as tell:
+        if scene is None:
+            folder, reports = out / "hard", hard_suite(out / "hard", progress=tell)
+        else:
+            folder = out / f"{scene.stem}-report"
+            reports = (compare(scene, folder, progress=tell),)
+    for each in reports:
+        typer.echo(str(each))
+    console.print(f"report: {folder}")
 
 
 @app.command(epilog="Example: pantograph schema > scene.schema.json")

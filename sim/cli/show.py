@@ -31,6 +31,16 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None] | None
         yield lambda done: bar.update(task, completed=done)
 
 
+@contextmanager
+def status(what: str) -> Iterator[Callable[[str], None] | None]:
+    """A line that tells what is at work, on a terminal; yields a function that takes it."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with Console(stderr=True).status(what) as line:
+        yield lambda at_work: line.update(f"{what}: {at_work}")
+
+
 def summary(recording: Recording) -> Table:
     """Simulated and wall time, evaluations, energy, error."""
     stats, t = recording.stats, recording.t
