@@ -208,7 +208,7 @@ class Rig(Item):
         if len(inside) > 1:
             raise RigError(
                 f"{self._file}: the scene has several joints {joint!r}: {', '.join(inside)}; "
-                f"say which model the rig is, with a line such as: prefix = "{inside[0].rsplit("/", 1)[0]}"'
+                f"say which model the rig is, with a line such as: prefix = {inside[0].rsplit('/', 1)[0]!r}"
             )
         return inside[0] if inside else joint
 
