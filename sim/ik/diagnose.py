@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .closed_form import closed_form
 from .descend import Descent, descend, sharpen
 from .goals import Goal, Orientation, Pose, Position, Rows
-from .problem import Problem, freedom_names
+from .problem import Problem, freedom_names, unwound
 from .proofs import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
 from .search import Search
 from .settle import settle
@@ -35,12 +35,13 @@ class Diagnosis:
 def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
     """Verdict on a problem that no start solved; `nearest` is the best pose found."""
     goals = problem.goals
-    gaps = {goal: goal_gap(problem, goal, search.start) for goal in goals}
-    blocked = [g for g in goals if _exceeds(gaps[g], g) and not _is_range(gaps[g])]
+    unlimited = problem.without_limits()
+    gaps = {goal: goal_gap(unlimited, goal, search.start) for goal in goals}
+    blocked = [g for g in goals if _exceeds(gaps[g], g)]
     if blocked:
         return _out_of_reach(problem, search, nearest, blocked[0], gaps[blocked[0]])
     for a, b in pairs(goals):
-        gap = pair_gap(problem, a, b, search.start)
+        gap = pair_gap(unlimited, a, b, search.start)
         if _exceeds(gap, a, b):
             return _conflict(problem, search, nearest, (a, b), gap)
     free = _without_limits(problem, search, nearest)
@@ -58,10 +59,6 @@ def _exceeds(gap: Gap, *goals: Goal) -> bool:
     return not free and (gap.position > room or gap.rotation > room)
 
 
-def _is_range(gap: Gap) -> bool:
-    return gap.by == "the joint's range"
-
-
 def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array | None:
     """A solution (nq,) that leaves the limits as little as was found; None without any."""
     free = problem.without_limits()
@@ -72,7 +69,7 @@ def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array
     search.iterations += looking.iterations
     if not len(found):
         return None
-    found = free.space.nearest_turns(found, _middles(problem, search.start))
+    found = unwound(free, found, problem.space.middle(search.start, problem.moved))
     excess = problem.space.excess(found)
     order = np.argsort(np.sum(excess**2, axis=1))[:3]
 
@@ -87,10 +84,6 @@ def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array
     return min(ends, key=lambda end: end.value).q
 
 
-def _middles(problem: Problem, start: Array) -> Array:
-    return problem.space.middle(start, problem.moved)
-
-
 def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Diagnosis:
     """Limits are the reason, unless the solution found without them is inside after all."""
     inside = descend(problem, problem.space.clip(free[None]))
@@ -102,7 +95,7 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
     for v in np.flatnonzero(excess > 1e-9):
         name = freedom_names(problem.model, np.arange(problem.space.nv) == v)[0]
         joints[name] = max(joints[name], float(excess[v]))
-    proved = _is_range_only(problem, search) or _proved_held(problem, search)
+    proved = _proved_held(problem, search)
     position, rotation = _sizes(problem, nearest.r)
     names = " and ".join(f"{name} (by {far:.4g})" for name, far in joints.items())
     reason = f"without limits they are met, with {names} outside; inside, {_words(position, rotation)} remain"
@@ -111,11 +104,12 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
     return Diagnosis(verdict, q_free=free, nearest=nearest.q[0])
 
 
-def _is_range_only(problem: Problem, search: Search) -> bool:
-    return any(_is_range(goal_gap(problem, g, search.start)) for g in problem.goals)
-
-
 def _proved_held(problem: Problem, search: Search) -> bool:
+    """Whether the ranges of the joints prove that nothing inside them meets the goals."""
+    if any(_exceeds(goal_gap(problem, g, search.start), g) for g in problem.goals):
+        return True
+    if any(_exceeds(pair_gap(problem, a, b, search.start), a, b) for a, b in pairs(problem.goals)):
+        return True
     if closed_form_outside(problem, closed_form(problem, search.start)) is not None:
         return True
     return subdivision(problem)

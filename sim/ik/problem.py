@@ -161,3 +161,10 @@ def freedom_names(model: mujoco.MjModel, mask: NDArray[np.bool_]) -> tuple[str, 
     return tuple(
         dict.fromkeys(name_of(model, "joint", int(model.dof_jntid[v])) for v in np.flatnonzero(mask))
     )
+
+
+def unwound(problem: Problem, q: Array, to: Array) -> Array:
+    """`q` (n, nq) with whole turns of hinges undone towards `to`, where the goals stay met."""
+    near = problem.space.nearest_turns(q, to)
+    met = problem.met(problem.raw(near).r)
+    return np.where(met[:, None], near, q)

@@ -44,7 +44,7 @@ NO_GAP = Gap(0.0, 0.0, "")
 
 
 def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
-    """Least violation of one goal that the lengths of its chain prove, limits of hinges left aside."""
+    """Least violation of one goal that the lengths of its chain and the problem's limits prove."""
     position = rotation = 0.0
     by = ""
     if isinstance(goal, (Position, Pose)):
@@ -61,7 +61,7 @@ def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
     if isinstance(goal, (PointOnPlane, PointOnLine)):
         position, by = _surface_gap(problem, goal, q), "the reach of the chain"
     if isinstance(goal, JointValue):
-        at, v = _scalar_joint(problem.kinematics, goal.joint)
+        _, v = _scalar_joint(problem.kinematics, goal.joint)
         low, high = problem.space.low[v], problem.space.high[v]
         rotation, by = max(0.0, low - goal.value, goal.value - high), "the joint's range"
     return Gap(position, rotation, by) if position > 0 or rotation > 0 else NO_GAP
@@ -86,12 +86,17 @@ def _turning(problem: Problem, goal: Orientation | Pose, q: Array) -> float:
     """Angle that a chain of parallel axes cannot make up."""
     f = problem.kinematics.frame(goal.at)
     base = None if goal.relative_to is None else problem.kinematics.frame(goal.relative_to)
-    joints = [j for j in f.joints] + ([] if base is None else list(base.joints))
+    joints = list(f.joints) + ([] if base is None else list(base.joints))
     turning = [j for j in joints if problem.moved[j.v] and int(j.type) != SLIDE]
     if any(int(j.type) != HINGE for j in turning):
         return 0.0
     R = _rotation(f, q) if base is None else _rotation(base, q).T @ _rotation(f, q)
-    axes = [_axis(g, j, q) for g in ([f] if base is None else [f, base]) for j in g.joints if j in turning]
+    axes = [
+        _axis(g, j, q)
+        for g in ([f] if base is None else [f, base])
+        for j in g.joints
+        if j.v in {t.v for t in turning}
+    ]
     if any(np.linalg.norm(np.cross(a, axes[0])) > 1e-9 for a in axes):
         return 0.0
     axis = axes[0] if axes else None

@@ -3,15 +3,15 @@
 Between the anchors of consecutive turning joints a path has hops: vectors fixed in a link, up to the travel of
 slides. Their lengths bound the distance of the ends, as in a polygon: within [max(0, 2 max l - sum l), sum l].
 A hinge's anchor may stand anywhere on its axis; every choice gives a bound. When all axes are parallel, the
-height along them does not change and the polygon lies in a plane, where the bounds are attained. Limits of
-slides count, limits of hinges do not.
+height along them does not change and the polygon lies in a plane, where the bounds are attained. Two hops with
+a hinge between them may count as one side, whose length the hinge's range bounds (law of cosines).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,11 +72,22 @@ def _extremes(v: Array, travels: tuple[Travel, ...]) -> tuple[float, float]:
     return float(np.sqrt(2 * lsq_linear(A, -v, bounds, tol=1e-14).cost)) * (1 - 1e-9), high
 
 
+class Turn(NamedTuple):
+    """A turning joint between two hops: kind, its frame R (3, 3) in the link before it in the tree, the range
+    of its angle, and whether the path runs outward over it."""
+
+    kind: int
+    R: Array
+    low: float
+    high: float
+    outward: bool = True
+
+
 class Path(NamedTuple):
-    """Hops from one frame to another and whether the chain between them moves at all."""
+    """Hops from one frame to another and the joints between them."""
 
     hops: tuple[Hop, ...]
-    turns: tuple[int, ...]  # kinds of the joints between the hops
+    turns: tuple[Turn, ...]
 
 
 class Reach(NamedTuple):
@@ -119,30 +130,24 @@ def path(a: Frame, b: Frame, space: Space, moved: NDArray[np.bool_], q: Array) -
     halves = [_hops(f, f.joints[shared:], space, moved, q) for f in (a, b)]
     if halves[0] is None or halves[1] is None:
         return None
-    (first_a, rest_a, kinds_a), (first_b, rest_b, kinds_b) = halves  # type: ignore[misc]
+    (first_a, rest_a, turns_a), (first_b, rest_b, turns_b) = halves
     back = tuple(Travel(-t.axis, t.low, t.high) for t in first_a.travels)
     middle = Hop(first_b.vector - first_a.vector, back + first_b.travels, first_a.end, first_b.end)
     turned = [
         Hop(-h.vector, tuple(Travel(-t.axis, t.low, t.high) for t in h.travels), h.end, h.start)
         for h in reversed(rest_a)
     ]
-    return Path((*turned, middle, *rest_b), (*reversed(kinds_a), *kinds_b))
+    inward = [t._replace(outward=False) for t in reversed(turns_a)]
+    return Path((*turned, middle, *rest_b), (*inward, *turns_b))
 
 
 def _hops(
-    f: Frame,
-    joints: tuple,
-    space: Space,
-    moved: NDArray[np.bool_],
-    q: Array,  # type: ignore[type-arg]
-) -> tuple[Hop, list[Hop], list[int]] | None:
-    """First hop (from the common frame's origin), the others, and the kinds of the joints between them."""
+    f: Frame, joints: tuple[Any, ...], space: Space, moved: NDArray[np.bool_], q: Array
+) -> tuple[Hop, list[Hop], list[Turn]] | None:
+    """First hop (from the common frame's origin), the others, and the joints between them."""
     hops: list[Hop] = []
-    kinds: list[int] = []
+    turns: list[Turn] = []
     T, travels, start = np.eye(4), [], None
-    shared = len(f.joints) - len(joints)
-    if shared:  # the first shared anchor's frame: hops of both halves start there
-        T = np.eye(4)
     for joint in joints:
         T = T @ joint.X
         kind = int(joint.type)
@@ -157,13 +162,14 @@ def _hops(
         else:
             end = T[:3, 2] if kind == HINGE else None
             hops.append(Hop(T[:3, 3].copy(), tuple(travels), start, end))
-            kinds.append(kind)
+            low, high = (space.low[joint.v], space.high[joint.v]) if kind == HINGE else (-np.inf, np.inf)
+            turns.append(Turn(kind, T[:3, :3].copy(), low - joint.rest, high - joint.rest))
             T, travels, start = np.eye(4), [], np.array([0.0, 0.0, 1.0]) if kind == HINGE else None
     hops.append(Hop((T @ f.X_end)[:3, 3], tuple(travels), start, None))
-    return hops[0], hops[1:], kinds
+    return hops[0], hops[1:], turns
 
 
-def standing(joint, q: Array) -> Array:  # type: ignore[no-untyped-def]
+def standing(joint: Any, q: Array) -> Array:
     """Pose (4, 4) across a joint that stands at q (nq,)."""
     X = np.eye(4)
     kind = int(joint.type)
@@ -186,9 +192,49 @@ def reach(p: Path) -> Reach:
         height, polygon = flat
         low = np.hypot(height.low, polygon.low)
         return Reach(float(low), float(np.hypot(height.high, polygon.high)))
-    plain = _polygon([h.lengths() for h in p.hops])
-    shifted = _polygon(_shortest(p))
-    return Reach(max(plain.low, shifted.low), min(plain.high, shifted.high))
+    return _tightest(p, [h.lengths() for h in p.hops], [_shortest(p)], flat=False)
+
+
+def _tightest(
+    p: Path, lengths: list[tuple[float, float]], others: list[list[tuple[float, float]]], *, flat: bool
+) -> Reach:
+    """The best of the polygons whose sides are hops, or pairs of hops with the hinge between them."""
+    sides = [lengths, *others, *(_merged(p, lengths, first, flat) for first in (0, 1))]
+    bounds = [_polygon(side) for side in sides]
+    return Reach(max(b.low for b in bounds), min(b.high for b in bounds))
+
+
+def _merged(p: Path, lengths: list[tuple[float, float]], first: int, flat: bool) -> list[tuple[float, float]]:
+    """Sides with hops 2i + first and the next one taken together over their hinge, within its range."""
+    out, i = list(lengths[:first]), first
+    while i < len(lengths):
+        pair = p.hops[i : i + 2]
+        if len(pair) == 2 and p.turns[i].kind == HINGE and not pair[0].travels and not pair[1].travels:
+            out.append(_across(pair[0].vector, pair[1].vector, p.turns[i], flat))
+            i += 2
+        else:
+            out.append(lengths[i])
+            i += 1
+    return out
+
+
+def _across(one: Array, two: Array, turn: Turn, flat: bool) -> tuple[float, float]:
+    """Least and greatest |u + Rz(th) w| over a hinge's range, u and w before and after it in its frame."""
+    u, w = (one, two) if turn.outward else (-two, -one)
+    u = turn.R.T @ u
+    if flat:
+        u, w = u * [1.0, 1.0, 0.0], w * [1.0, 1.0, 0.0]
+    a, b = u[0] * w[0] + u[1] * w[1], u[1] * w[0] - u[0] * w[1]
+    base = float(u @ u + w @ w + 2 * u[2] * w[2])
+    peak = float(np.arctan2(b, a))
+    size = 2 * float(np.hypot(a, b))
+    if turn.high - turn.low >= 2 * np.pi:
+        values = [base - size, base + size]
+    else:
+        turns = [peak + np.pi * k for k in range(-6, 7)]
+        angles = [turn.low, turn.high, *(t for t in turns if turn.low <= t <= turn.high)]
+        values = [base + size * float(np.cos(t - peak)) for t in angles]
+    return float(np.sqrt(max(0.0, min(values)))), float(np.sqrt(max(0.0, *values)))
 
 
 def _polygon(lengths: list[tuple[float, float]]) -> Reach:
@@ -209,7 +255,7 @@ def _open_low(lengths: list[tuple[float, float]]) -> float:
 
 def _shortest(p: Path) -> list[tuple[float, float]]:
     """Lengths of the hops with the hinges' anchors where the whole is shortest (a convex problem)."""
-    hinges = [i for i, kind in enumerate(p.turns) if kind == HINGE]
+    hinges = [i for i, turn in enumerate(p.turns) if turn.kind == HINGE]
     if not hinges or any(not np.isfinite([t.low, t.high]).all() for h in p.hops for t in h.travels):
         return [h.lengths() for h in p.hops]
     from scipy.optimize import minimize
@@ -231,7 +277,7 @@ class Range(NamedTuple):
 
 def planar(p: Path) -> tuple[Range, Reach] | None:
     """Height of the end over the start along the common axis, and distance across it; None if not planar."""
-    if not p.turns or any(kind != HINGE for kind in p.turns):
+    if not p.turns or any(turn.kind != HINGE for turn in p.turns):
         return None
     for i, hop in enumerate(p.hops):
         if 0 < i < len(p.hops) - 1 and not _parallel(hop.start, hop.end):
@@ -253,7 +299,7 @@ def planar(p: Path) -> tuple[Range, Reach] | None:
         if hop.start is not None and hop.end is not None and float(hop.start @ hop.end) < 0:
             sign = -sign
     low = max(0.0, heights[0], -heights[1])
-    return Range(low, max(abs(heights[0]), abs(heights[1]))), _polygon(lengths)
+    return Range(low, max(abs(heights[0]), abs(heights[1]))), _tightest(p, lengths, [], flat=True)
 
 
 def _parallel(a: Array | None, b: Array | None) -> bool:

@@ -45,10 +45,10 @@ class Search:
         if len(inside):
             found.append(self._attempt(inside, iterations=12))
         if every or not len(found[-1]):
-            found.append(self._raced(every=every))
-        if every or not len(found[-1]):
             starts = np.stack([self.start, space.middle(self.start, moved)])
-            found.append(self._attempt(starts))
+            found.append(self._attempt(starts, iterations=40, first=not every))
+        if every or not len(found[-1]):
+            found.append(self._raced(every=every))
         blocks = iter(_BLOCKS)
         size = next(blocks)
         while self.used < self.restarts and (every or not sum(map(len, found))):

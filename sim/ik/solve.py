@@ -15,7 +15,7 @@ from .descend import Descent, sharpen
 from .diagnose import diagnose
 from .goals import Goal
 from .preferences import Preference, Wishes, preference
-from .problem import Problem
+from .problem import Problem, unwound
 from .search import Search
 from .settle import Wish, settle
 from .space import Space
@@ -100,12 +100,12 @@ def _parts(problem: Problem) -> tuple[Problem, Problem | None]:
 
 def _settled(judged: Problem, space: Space, found: Array, wish: Wish, start: Array, *, every: bool) -> Array:
     """Distinct solutions (k, nq) that serve the wish best, best first."""
-    found = space.nearest_turns(found, start)
+    found = unwound(judged, found, start)
     value = np.array([np.sum(wish(q[None]).r ** 2) for q in found])
     settled = []
     for i in np.argsort(value, kind="stable")[: None if every else 3]:
         end = settle(judged, found[i], wish)
-        settled.append((end.value, space.nearest_turns(end.q[None], start)[0]))
+        settled.append((end.value, unwound(judged, end.q[None], start)[0]))
     settled.sort(key=lambda pair: pair[0])
     return distinct(space, np.array([q for _, q in settled]))
 
