@@ -7,19 +7,20 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import mujoco
-import numpy as np
 
-from .dynamics.smooth import Smooth
-from .errors import EngineError
 from .hard_cases import HARD_CASES, HardCase
+from .scene_work import is_free, scene_case, scene_references, scene_runners
 from .work_precision import (
     Case,
     Motion,
+    Reference,
     Row,
+    Runner,
     mujoco_reference,
     runners,
     smooth_or_none,
@@ -34,9 +35,30 @@ if TYPE_CHECKING:
     from .plan import Plan
     from .scene.schema import Scene
 
+Error: TypeAlias = Callable[[Motion], float]
+
 ENGINES = ("smooth", "mujoco", "scipy")
 TARGETS = (1e-3, 1e-6, 1e-9)
 """Errors [rad, m] that the recommendation is about."""
+
+
+RIVALS = ("mujoco", "contact")
+"""Engines whose best setting a recommendation is compared with."""
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What errors are measured against.
+
+    Attributes:
+        source: in words.
+        uncertainty: error of the reference itself; errors below it say nothing.
+        engine: whose rows; "" for all.
+    """
+
+    source: str
+    uncertainty: float
+    engine: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,23 +68,27 @@ class Report:
     Attributes:
         name: of the case.
         rows: the table; `Row.error` in rad and m for a motion, in units of the case's scale for a hard case.
-        reference: what errors are measured against, in words.
-        uncertainty: error of that reference itself; errors below it say nothing.
+        yardsticks: what errors are measured against.
         notes: what was left out, and why.
     """
 
     name: str
     rows: tuple[Row, ...]
-    reference: str
-    uncertainty: float
+    yardsticks: tuple[Yardstick, ...]
     notes: tuple[str, ...] = ()
 
-    def cheapest(self, target: float, *, engine: str | None = None) -> Row | None:
-        """The row of least processor time whose error is at most `target`; None when there is none."""
+    def uncertainty(self, engine: str) -> float:
+        """Error of the reference that an engine's rows are measured against."""
+        return next((y.uncertainty for y in self.yardsticks if y.engine in ("", engine)), math.nan)
+
+    def cheapest(self, target: float, *, engines: Sequence[str] = ()) -> Row | None:
+        """The row of least processor time with an error of at most `target`, of some engines or of all."""
         good = [
             row
             for row in self.rows
-            if row.error <= target and engine in (None, row.engine) and self.uncertainty <= target
+            if row.error <= target
+            and (not engines or row.engine in engines)
+            and self.uncertainty(row.engine) <= target
         ]
         return min(good, key=lambda row: row.cpu_s, default=None)
 
@@ -72,14 +98,15 @@ class Report:
         for target in TARGETS:
             best = self.cheapest(target)
             if best is None:
-                why = "the reference is not that sure" if self.uncertainty > target else "nothing reaches it"
+                unsure = all(y.uncertainty > target for y in self.yardsticks)
+                why = "the reference is not that sure" if unsure else "nothing reaches it"
                 sentences.append(f"Error {target:.0e}: {why}.")
                 continue
             text = f"Error {target:.0e}: {_setting(best)} in {_seconds(best.cpu_s)} of processor time"
-            rival = self.cheapest(target, engine="mujoco")
-            if best.engine != "mujoco" and rival is not None:
+            rival = self.cheapest(target, engines=RIVALS)
+            if best.engine not in RIVALS and rival is not None:
                 text += f", {rival.cpu_s / best.cpu_s:.3g} times less than {_setting(rival)}"
-            elif best.engine != "mujoco" and any(row.engine == "mujoco" for row in self.rows):
+            elif best.engine not in RIVALS and any(row.engine in RIVALS for row in self.rows):
                 text += "; MuJoCo's integrators do not reach it at the steps tried"
             sentences.append(text + ".")
         return "\n".join([*sentences, *_stiffness(self.rows)])
@@ -90,16 +117,26 @@ class Report:
 
     def figure(self) -> Figure:
         """Error against processor time and against evaluations, a line for each method."""
+        from matplotlib import colormaps
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(11, 5), layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
-        colors = {"smooth": "tab:blue", "mujoco": "tab:red", "scipy": "tab:green", "torch": "tab:purple"}
+        shades = {
+            "smooth": "Blues",
+            "mujoco": "Reds",
+            "contact": "Reds",
+            "scipy": "Greens",
+            "torch": "Purples",
+        }
         markers = "osv^<>DPX*dph"
-        for n, (key, rows) in enumerate(_by_method(self.rows).items()):
+        methods = _by_method(self.rows)
+        for n, (key, rows) in enumerate(methods.items()):
+            kin = [other for other in methods if other[0] == key[0]]
+            shade = 0.4 + 0.6 * (kin.index(key) + 1) / len(kin)
             seen = [row for row in rows if row.error > 0]
             style = {
-                "color": colors.get(key[0], "black"),
+                "color": colormaps[shades[key[0]]](shade),
                 "marker": markers[n % len(markers)],
                 "markersize": 4,
                 "linestyle": "-" if key[2] == "tolerance" else ":",
@@ -113,7 +150,7 @@ class Report:
         for ax, what in zip(
             axes, ("processor time [ms]", "evaluations of the equations of motion"), strict=True
         ):
-            ax.axhspan(1e-17, max(self.uncertainty, 1e-17), color="0.9")
+            ax.axhspan(1e-17, max([1e-17, *(y.uncertainty for y in self.yardsticks)]), color="0.93", zorder=0)
             ax.set_xlabel(what)
             ax.grid(alpha=0.3)
         errors = [row.error for row in self.rows if row.error > 0]
@@ -134,8 +171,7 @@ class Report:
         finite = [{k: _json(v) for k, v in row.items()} for row in self.table()]
         content = {
             "name": self.name,
-            "reference": self.reference,
-            "uncertainty": _json(self.uncertainty),
+            "references": [asdict(yardstick) for yardstick in self.yardsticks],
             "notes": list(self.notes),
             "recommendation": self.recommendation().splitlines(),
             "rows": finite,
@@ -146,7 +182,8 @@ class Report:
         return folder
 
     def __str__(self) -> str:
-        lines = [self.name, f"Reference: {self.reference}; its own error about {self.uncertainty:.1e}."]
+        lines = [self.name]
+        lines += [f"Reference: {y.source}; its own error about {y.uncertainty:.1e}." for y in self.yardsticks]
         lines += [f"Note: {note}." for note in self.notes]
         lines += ["", f"{'engine':8}{'method':14}{'setting':>20}{'error':>10}{'cpu':>10}{'evaluations':>13}"]
         for row in self.rows:
@@ -172,27 +209,24 @@ def report(
         subject: a case, a hard case, a scene or its plan or file; a bare model swings from its first
             configuration for two seconds.
         out_dir: folder for table.csv, report.json, report.txt and report.png; nothing is written when None.
-        engines: of "smooth", "mujoco", "scipy" and "torch" (extra `torch`).
+        engines: of "smooth", "mujoco", "scipy" and "torch" (extra `torch`), for free motion. A scene with
+            keyed joints, servos, controllers or contacts runs on the smooth and the contact engine.
         budget_s: a method is refined until a run costs that much processor time [s].
         progress: told the method at work.
 
     Raises:
-        EngineError: a scene that the report cannot judge yet, or a reference that did not reach its end.
+        EngineError: an unknown engine, or a reference that did not reach its end.
+        SceneError: a scene with mistakes.
     """
-    hard = subject if isinstance(subject, HardCase) else None
-    case, notes = (hard.case(), ()) if hard is not None else case_of(subject)
-    smooth, why = smooth_or_none(case.model)
-    if smooth is None:
-        notes = (*notes, f"no smooth engine: {why}")
-    elif smooth.differences:
-        notes = (*notes, *(f"smooth engine: {difference}" for difference in smooth.differences))
-    error, source, uncertainty = _measure(case, hard, smooth)
-    rows: list[Row] = []
-    for runner in runners(case, smooth, engines):
-        if progress is not None:
-            progress(f"{runner.engine} {runner.method} by {runner.knob}")
-        rows += sweep(runner, error, floor=uncertainty, budget_s=budget_s)
-    result = Report(case.name, tuple(rows), source, uncertainty, notes)
+    if isinstance(subject, HardCase | Case | mujoco.MjModel):
+        result = _of_case(subject, engines, budget_s, progress)
+    else:
+        plan = _plan(subject)
+        result = (
+            _of_case(scene_case(plan), engines, budget_s, progress)
+            if is_free(plan)
+            else _of_scene(plan, budget_s, progress)
+        )
     if out_dir is not None:
         result.write(out_dir)
     return result
@@ -218,57 +252,77 @@ def hard_suite(
     return tuple(reports)
 
 
-def case_of(subject: Case | Scene | Plan | mujoco.MjModel | str | Path) -> tuple[Case, tuple[str, ...]]:
-    """The motion to compare, and notes on what it leaves out.
-
-    Raises:
-        EngineError: the scene has keyed joints, a controller, servos or pushes, which reports do not do yet.
-    """
-    if isinstance(subject, Case):
-        return subject, ()
-    if isinstance(subject, mujoco.MjModel):
-        data = mujoco.MjData(subject)
-        return Case("model", subject, data.qpos.copy(), data.qvel.copy(), 2.0), ()
-    from .engines.interface import Role
+def _plan(subject: Scene | Plan | str | Path) -> Plan:
     from .plan import Plan, make_plan
     from .scene.load import load_scene
 
     if isinstance(subject, str | Path):
         subject = load_scene(subject)
-    plan = subject if isinstance(subject, Plan) else make_plan(subject)
-    problem = plan.problem
-    found = {
-        "a controller": plan.period is not None,
-        "keyed joints": bool(np.any(problem.roles == Role.KEYED)),
-        "servos that follow keys": bool(problem.servo),
-        "pushes": bool(problem.wrenches),
-    }
-    beyond = [words for words, present in found.items() if present]
-    if beyond:
-        raise EngineError(
-            f"a report compares free motion so far; this scene has {', '.join(beyond)}: "
-            "give their joints the passive role, or report on a copy without them"
-        )
-    state = problem.state0
-    name = str(plan.setup.scene.model_dump().get("name") or "scene")
-    return Case(name, problem.model, state.q, state.v, problem.duration), ()
+    return subject if isinstance(subject, Plan) else make_plan(subject)
 
 
-def _measure(
-    case: Case, hard: HardCase | None, smooth: Smooth | None
-) -> tuple[Callable[[Motion], float], str, float]:
-    """How a motion's error is found, against what, and how sure that is."""
+def _of_case(
+    subject: Case | HardCase | mujoco.MjModel,
+    engines: Sequence[str],
+    budget_s: float,
+    progress: Callable[[str], None] | None,
+) -> Report:
+    hard = subject if isinstance(subject, HardCase) else None
+    case = _case(subject)
+    smooth, why = smooth_or_none(case.model)
+    notes = (f"no smooth engine: {why}",) if smooth is None else smooth.differences
     if hard is not None:
-        return (lambda motion: hard.error(motion, case.model)), hard.source, 1e-15
-    if smooth is not None:
-        reference = smooth_reference(case, smooth)
+        error: Error = partial(hard.error, model=case.model)
+        yardstick = Yardstick(hard.source, 1e-15)
     else:
-        reference = mujoco_reference(case, case.duration / case.frames / 2**10)
-    return (
-        (lambda motion: trajectory_error(case, motion, reference.motion)),
-        reference.source,
-        reference.uncertainty,
-    )
+        if smooth is not None:
+            reference = smooth_reference(case, smooth)
+        else:
+            reference = mujoco_reference(case, case.duration / case.frames / 2**10)
+        error = _against(case, reference)
+        yardstick = Yardstick(reference.source, reference.uncertainty)
+    rows: list[Row] = []
+    for runner in runners(case, smooth, engines):
+        _tell(progress, runner)
+        rows += sweep(runner, error, floor=yardstick.uncertainty, budget_s=budget_s)
+    return Report(case.name, tuple(rows), (yardstick,), notes)
+
+
+def _case(subject: Case | HardCase | mujoco.MjModel) -> Case:
+    if isinstance(subject, HardCase):
+        return subject.case()
+    if isinstance(subject, Case):
+        return subject
+    data = mujoco.MjData(subject)
+    return Case("model", subject, data.qpos.copy(), data.qvel.copy(), 2.0)
+
+
+def _of_scene(plan: Plan, budget_s: float, progress: Callable[[str], None] | None) -> Report:
+    case = scene_case(plan)
+    found, notes = scene_runners(plan, case)
+    engines = list(dict.fromkeys(runner.engine for runner in found))
+    references = scene_references(engines, plan, case, budget_s=4 * budget_s)
+    if len(references) == 2:
+        apart = trajectory_error(case, references["smooth"].motion, references["contact"].motion)
+        notes.append(
+            f"the physics of the two engines lie {apart:.2g} rad or m apart, beside the errors below"
+        )
+    rows: list[Row] = []
+    for runner in found:
+        _tell(progress, runner)
+        reference = references[runner.engine]
+        rows += sweep(runner, _against(case, reference), floor=reference.uncertainty, budget_s=budget_s)
+    sticks = tuple(Yardstick(r.source, r.uncertainty, engine) for engine, r in references.items())
+    return Report(case.name, tuple(rows), sticks, tuple(notes))
+
+
+def _against(case: Case, reference: Reference) -> Error:
+    return lambda motion: trajectory_error(case, motion, reference.motion)
+
+
+def _tell(progress: Callable[[str], None] | None, runner: Runner) -> None:
+    if progress is not None:
+        progress(f"{runner.engine} {runner.method} by {runner.knob}")
 
 
 def _by_method(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:

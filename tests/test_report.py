@@ -9,7 +9,7 @@ import pytest
 from oracles import pendulum
 from pantograph.sim.errors import EngineError
 from pantograph.sim.hard_cases import HARD_CASES
-from pantograph.sim.report import Report, report
+from pantograph.sim.report import Report, Yardstick, report
 from pantograph.sim.work_precision import Case, Row, runners, smooth_or_none, smooth_reference
 
 PENDULUM = """<mujoco><worldbody><body><joint axis="0 -1 0"/>
@@ -61,10 +61,10 @@ def test_files(swing_report):
         rows = list(csv.DictReader(file))
     assert len(rows) == len(content["rows"]) == len(result.rows) > 60
     assert float(rows[5]["cpu_s"]) == result.rows[5].cpu_s
-    assert content["uncertainty"] == result.uncertainty
+    assert content["references"][0]["uncertainty"] == result.uncertainty("smooth")
     assert (folder / "report.png").read_bytes()[:4] == b"\x89PNG"
     text = (folder / "report.txt").read_text()
-    assert result.reference in text and result.recommendation() in text
+    assert result.yardsticks[0].source in text and result.recommendation() in text
 
 
 def test_errors_fall_with_the_setting(swing_report):
@@ -93,11 +93,11 @@ def test_recommendation_takes_the_cheapest_that_is_good_enough():
         row("mujoco", 1e-7, 50.0),
         row("smooth", np.nan, 0.1),
     )
-    lines = Report("x", rows, "reference", 1e-8).recommendation().splitlines()
+    lines = Report("x", rows, (Yardstick("reference", 1e-8),)).recommendation().splitlines()
     assert "in 1 s" in lines[0] and "50 times less" in lines[0]
     assert "in 5 s" in lines[1] and "10 times less" in lines[1]
     assert "not that sure" in lines[2], "an error below the reference's own says nothing"
-    lines = Report("x", rows, "reference", 1e-12).recommendation().splitlines()
+    lines = Report("x", rows, (Yardstick("reference", 1e-12),)).recommendation().splitlines()
     assert "nothing reaches it" in lines[2]
 
 
@@ -105,11 +105,11 @@ def test_stiffness_is_said():
     rows = tuple(
         row("smooth", 1e-5, 1.0, knob="tolerance", setting=t, n=n) for t, n in ((1e-3, 900), (1e-6, 950))
     )
-    assert "Stiff" in Report("x", rows, "reference", 0.0).recommendation()
+    assert "Stiff" in Report("x", rows, (Yardstick("reference", 0.0),)).recommendation()
     rows = tuple(
         row("smooth", 1e-5, 1.0, knob="tolerance", setting=t, n=n) for t, n in ((1e-3, 200), (1e-6, 950))
     )
-    assert "Stiff" not in Report("x", rows, "reference", 0.0).recommendation()
+    assert "Stiff" not in Report("x", rows, (Yardstick("reference", 0.0),)).recommendation()
 
 
 def test_stiff_servo_is_called_stiff():
@@ -127,7 +127,60 @@ def test_a_model_with_contacts_is_compared_among_mujocos_integrators():
     result = report(case, engines=("smooth", "mujoco"), budget_s=0.002)
     assert {r.engine for r in result.rows} == {"mujoco"}
     assert any("may touch" in note for note in result.notes)
-    assert result.uncertainty > 0
+    assert result.uncertainty("mujoco") > 0
+
+
+SCENE = """
+format = 1
+title = "Swings"
+duration = 0.4
+angle = "degree"
+
+[[models]]
+file = "double_pendulum"
+
+[initial.position]
+shoulder = 60
+
+[physics]
+contacts = "none"
+"""
+TRACKED = """
+[roles]
+tracked = ["shoulder"]
+
+[[keys]]
+joint = "shoulder"
+times = [0, 0.4]
+values = [60, 20]
+
+[controller]
+law = "pd"
+period = 0.01
+frequency = 4
+"""
+
+
+def test_a_free_scene_is_a_case(tmp_path):
+    (tmp_path / "free.toml").write_text(SCENE)
+    result = report(tmp_path / "free.toml", tmp_path / "out", engines=("smooth",), budget_s=0.001)
+    assert result.name == "Swings"
+    assert any(r.knob == "tolerance" for r in result.rows)
+    assert min(r.error for r in result.rows) < 1e-9
+
+
+def test_a_scene_with_a_controller_runs_on_both_engines(tmp_path):
+    """The engines hold the same samples: errors fall with the order, and the physics agree."""
+    (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
+    result = report(tmp_path / "tracked.toml", budget_s=0.01)
+    assert {r.engine for r in result.rows} == {"smooth", "contact"}
+    for engine in ("smooth", "contact"):
+        rows = [r for r in result.rows if r.engine == engine and r.method == "rk4"]
+        assert rows[0].setting == 0.01
+        assert rows[1].error < rows[0].error / 10, "order 4"
+        assert result.uncertainty(engine) < 1e-6
+    apart = next(float(note.split("lie ")[1].split()[0]) for note in result.notes if "lie" in note)
+    assert apart < 1e-6
 
 
 def test_unknown_engines_are_named():

@@ -1,0 +1,133 @@
+"""Work against precision of whole scenes: keyed joints, servos and sampled controllers included.
+
+Each engine is judged against its own far tighter run, so that its error is one of discretisation; how far the
+engines' physics lie apart (soft limits, friction) is told beside it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .compose import make_law
+from .control import Sampled
+from .engines.contact import INTEGRATORS, ContactEngine
+from .engines.interface import Engine, Role
+from .engines.smooth import SmoothEngine
+from .errors import EngineError
+from .integrate import TABLEAUS
+from .integrate.problems import constraints_of
+from .plan import Plan, can_touch
+from .work_precision import Case, Motion, Reference, trajectory_error
+
+FRAMES = 50
+FINEST = {"smooth": "dop853", "contact": "rk4"}
+"""The method of each engine's reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSteps:
+    """One method of one engine on a scene, by fixed steps (see `work_precision.Runner`)."""
+
+    plan: Plan
+    case: Case
+    engine: str
+    method: str
+    knob: str = "step"
+
+    def settings(self) -> Iterable[float]:
+        """The controller's period, or a frame's time, and its halves."""
+        longest = self.plan.period or self.case.duration / self.case.frames
+        return [longest / 2**k for k in range(12)]
+
+    def run(self, setting: float) -> Motion:
+        """The motion of the scene in steps of `setting` [s]."""
+        plan, case = self.plan, self.case
+        every = round(case.duration / case.frames / setting)
+        problem = replace(
+            plan.problem, step=setting, integrator=self.method, sample_every=every, duration=case.duration
+        )
+        controls = None
+        if plan.period is not None:
+            item = plan.setup.scene.controller
+            law = make_law(item.law if item else "pd", problem, item.parameters if item else {})
+            controls = Sampled(law, problem, plan.period)
+        engine: Engine = SmoothEngine() if self.engine == "smooth" else ContactEngine()
+        segment = engine.run(problem, (0.0, case.duration), controls)
+        q, v = (
+            np.full((case.frames + 1, case.model.nq), np.nan),
+            np.full((case.frames + 1, case.model.nv), np.nan),
+        )
+        n = min(len(segment.t), case.frames + 1)
+        q[:n], v[:n] = segment.q[:n], segment.v[:n]
+        return Motion(q, v, int(segment.stats["evaluations"]))
+
+
+def scene_case(plan: Plan) -> Case:
+    """The scene's motion with frames at whole periods of its controller."""
+    problem, frames = plan.problem, FRAMES
+    duration = problem.duration
+    if plan.period is not None:
+        every = max(1, round(duration / FRAMES / plan.period))
+        frames = max(1, int(duration / (every * plan.period) + 1e-9))
+        duration = frames * every * plan.period
+    name = plan.setup.scene.title or "scene"
+    return Case(name, problem.model, problem.state0.q, problem.state0.v, duration, frames=frames)
+
+
+def is_free(plan: Plan) -> bool:
+    """Whether the scene is motion from a state under constant controls, without constraints: a `Case`."""
+    problem = plan.problem
+    keyed = bool(np.any(problem.roles == Role.KEYED))
+    driven = plan.period is not None or bool(problem.servo) or bool(problem.wrenches)
+    return not (keyed or driven or constraints_of(problem.model))
+
+
+def scene_runners(plan: Plan, case: Case) -> tuple[list[SceneSteps], list[str]]:
+    """All methods of the engines that can run the scene, and why an engine cannot."""
+    found: list[SceneSteps] = []
+    notes = []
+    for engine, methods in (("smooth", TABLEAUS), ("contact", INTEGRATORS)):
+        if engine == "smooth" and can_touch(plan.problem.model):
+            notes.append("no smooth engine: bodies may touch; without contacts it could run the scene")
+            continue
+        trial = SceneSteps(plan, case, engine, FINEST[engine])
+        try:
+            trial.run(next(iter(trial.settings())))
+        except EngineError as error:
+            notes.append(f"no {engine} engine: {error}")
+        else:
+            found += [SceneSteps(plan, case, engine, name) for name in methods]
+    return found, notes
+
+
+def scene_references(
+    engines: Iterable[str], plan: Plan, case: Case, *, budget_s: float
+) -> dict[str, Reference]:
+    """The reference of each engine: steps that halve until two runs agree to 1e-10, or one costs `budget_s`.
+
+    Raises:
+        EngineError: a reference did not reach the end.
+    """
+    references = {}
+    for engine in engines:
+        runner = SceneSteps(plan, case, engine, FINEST[engine])
+        settings = list(runner.settings())
+        before, uncertainty, step = runner.run(settings[1]), float("nan"), settings[1]
+        for step in settings[2:]:
+            began = time.process_time()
+            motion = runner.run(step)
+            uncertainty = trajectory_error(case, before, motion)
+            before = motion
+            if uncertainty < 1e-10 or time.process_time() - began > budget_s:
+                break
+        if not np.isfinite(uncertainty):
+            raise EngineError(
+                f"{case.name}: the {engine} engine's reference did not reach {case.duration:g} s"
+            )
+        source = f"{engine} engine, {runner.method} at {step:.3g} s; uncertainty by twice that step"
+        references[engine] = Reference(before, uncertainty, source)
+    return references
