@@ -11,6 +11,7 @@ from ..models import name_of
 from .compose import make_law
 from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
+from .engines.smooth import adaptive_methods
 from .engines.smooth import methods as smooth_methods
 from .errors import SceneError, unknown
 from .scene.build import Setup, build, resolve
@@ -115,7 +116,7 @@ def _solver(scene: Scene) -> list[Mistake]:
     """Choices of the solver that no engine offers."""
     solver, mistakes = scene.solver, []
     if solver.integrator not in ("auto", *INTEGRATORS, *smooth_methods()):
-        known = ("auto", *INTEGRATORS, *smooth_methods())
+        known = sorted({"auto", *INTEGRATORS, *smooth_methods()})
         message = unknown("integrator", solver.integrator, known, where="this Pantograph")
         mistakes.append(Mistake(("solver", "integrator"), message))
     elif solver.engine == "contact" and solver.integrator not in ("auto", *INTEGRATORS):
@@ -123,6 +124,10 @@ def _solver(scene: Scene) -> list[Mistake]:
         mistakes.append(Mistake(("solver", "integrator"), message))
     if solver.tolerance is not None and solver.step != "auto":
         message = "give a tolerance (adaptive steps) or a step (fixed), not both"
+        mistakes.append(Mistake(("solver", "tolerance"), message))
+    elif solver.tolerance is not None and solver.integrator not in ("auto", *adaptive_methods()):
+        adaptive = ", ".join(adaptive_methods())
+        message = f"{solver.integrator!r} has fixed steps and follows no tolerance; adaptive are: {adaptive}"
         mistakes.append(Mistake(("solver", "tolerance"), message))
     if solver.step != "auto" and solver.step > scene.duration:
         message = f"a step of {solver.step:g} s is longer than the scene, {scene.duration:g} s"

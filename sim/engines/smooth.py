@@ -25,10 +25,17 @@ _HUGE = 1e10
 
 
 def methods() -> dict[str, int]:
-    """Names of the fixed-step methods, and their orders."""
+    """Names of the methods, and their orders."""
     from ..integrate import TABLEAUS
 
     return {name: tableau.order for name, tableau in TABLEAUS.items()}
+
+
+def adaptive_methods() -> tuple[str, ...]:
+    """Names of the methods that can follow a tolerance."""
+    from ..integrate import TABLEAUS
+
+    return tuple(name for name, tableau in TABLEAUS.items() if tableau.adaptive)
 
 
 def differences(problem: Problem) -> list[str]:

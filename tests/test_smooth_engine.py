@@ -1,0 +1,315 @@
+"""The smooth engine: equal to MuJoCo's where their physics is the same, and its stops at limits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles.sine import sine
+from pantograph.sim import Scene, make_plan, run
+from pantograph.sim.clip import Clip
+from pantograph.sim.curves import keyed
+from pantograph.sim.engines.contact import ContactEngine
+from pantograph.sim.engines.interface import Problem, Role, State
+from pantograph.sim.engines.smooth import SmoothEngine
+from scipy.integrate import solve_ivp
+
+G = 9.81
+
+SLIDE = """
+<mujoco><option timestep="0.002" gravity="0 0 -9.81"/><worldbody>
+  <body name="b"><joint name="z" type="slide" axis="0 0 1" range="-0.5 2" limited="true"/>
+    <geom size="0.1" mass="2" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><motor name="push" joint="z"/></actuator></mujoco>"""
+
+
+def scene_of(tmp_path, xml, **words):
+    file = tmp_path / "model.xml"
+    file.write_text(xml)
+    return Scene(models=[{"file": str(file)}], **words)
+
+
+@st.composite
+def problems(draw):
+    """Random trees with keyed joints, and held joint forces."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    spec = mujoco.MjSpec()
+    bodies = [spec.worldbody]
+    kinds = {
+        "hinge": mujoco.mjtJoint.mjJNT_HINGE,
+        "slide": mujoco.mjtJoint.mjJNT_SLIDE,
+        "ball": mujoco.mjtJoint.mjJNT_BALL,
+    }
+    tracks = {}
+    for i in range(draw(st.integers(1, 4))):
+        parent = bodies[draw(st.integers(0, len(bodies) - 1))]
+        body = parent.add_body(name=f"b{i}", pos=rng.normal(size=3) * 0.3)
+        kind = draw(st.sampled_from(["hinge", "slide", "ball", "free"]))
+        if kind == "free" and parent is spec.worldbody:
+            body.add_freejoint(name=f"j{i}")
+        else:
+            body.add_joint(
+                name=f"j{i}", type=kinds.get(kind, kinds["hinge"]), axis=rng.normal(size=3), damping=0.05
+            )
+            if kind in ("hinge", "slide") and draw(st.booleans()):
+                tracks[f"j{i}"] = keyed([0.0, 0.07, 0.2], [[0.0], [rng.normal()], [0.0]], kind="clamped")
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=0.05 + 0.1 * rng.random(3),
+            contype=0,
+            conaffinity=0,
+        )
+        bodies.append(body)
+    model = spec.compile()
+    q = np.array(model.qpos0)
+    mujoco.mj_integratePos(model, q, rng.normal(size=model.nv), 0.5)
+    clip = Clip(model, tracks, q)
+    roles = np.zeros(model.njnt, dtype=np.int8)
+    for name in tracks:
+        roles[model.joint(name).id] = Role.KEYED
+    v = rng.normal(size=model.nv)
+    start = clip.evaluate(0.0)
+    q[clip.qpos_mask], v[clip.dofs] = start.q[clip.qpos_mask], start.v[clip.dofs]
+    problem = Problem(
+        model=model,
+        state0=State(q, v, np.zeros(0)),
+        duration=0.1,
+        roles=roles,
+        clip=clip,
+        integrator="rk4",
+        step=0.002,
+        sample_every=10,
+        drives=np.zeros(0, dtype=np.int8),
+    )
+    return problem, rng.normal(size=model.nv)
+
+
+class Constant:
+    """Held joint forces, renewed at each period."""
+
+    def __init__(self, force, nu, period=0.01):
+        from pantograph.sim.engines.interface import Held
+
+        self.period, self.held = period, Held(np.zeros(nu), force)
+
+    def sample(self, k, t, q, v):
+        return self.held
+
+
+@settings(max_examples=15)
+@given(problems())
+def test_engines_agree_where_their_physics_is_the_same(case):
+    problem, force = case
+    force = np.where(problem.dofs(Role.KEYED), 0.0, force)
+    controls = Constant(force, 0)
+    span = (0.0, problem.duration)
+    ours = SmoothEngine().run(problem, span, controls)
+    theirs = ContactEngine().run(problem, span, controls)
+    np.testing.assert_array_equal(ours.t, theirs.t)
+    scale = 1 + np.abs(theirs.v).max() ** 2
+    # the contact engine's keyed accelerations are met to about 1e-7 of the forces on them
+    tolerance = 1e-6 if problem.dofs(Role.KEYED).any() else 1e-9
+    np.testing.assert_allclose(ours.q, theirs.q, atol=tolerance * scale)
+    np.testing.assert_allclose(ours.v, theirs.v, atol=10 * tolerance * scale)
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    [("euler", 1, (4e-3, 2e-3, 1e-3)), ("rk4", 4, (0.04, 0.02, 0.01)), ("dopri5", 5, (0.08, 0.04, 0.02))],
+)
+def test_keyed_motion_enters_every_method_at_its_full_order(tmp_path, method, order, steps):
+    """A pendulum, l = 1 m, on a pivot that moves as a sin(w t)."""
+    a, w = 0.3, 4.0
+    xml = """
+<mujoco><option gravity="0 0 -9.81"/><worldbody>
+  <body><joint name="pivot" type="slide" axis="1 0 0"/>
+    <geom size="0.05" mass="1" contype="0" conaffinity="0"/>
+    <body><joint name="swing" axis="0 -1 0"/>
+      <inertial pos="0 0 -1" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body>
+</worldbody></mujoco>"""
+    truth = solve_ivp(
+        lambda t, y: [y[1], -(G * np.sin(y[0]) - a * w * w * np.sin(w * t) * np.cos(y[0])) / (1 + 1e-9)],
+        (0, 1.6),
+        [0.5, 0.0],
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-14,
+    ).y[0, -1]
+    errors = []
+    for h in steps:
+        scene = scene_of(
+            tmp_path,
+            xml,
+            duration=1.6,
+            rate=1,
+            keys=[{"joint": "pivot", "times": [0.0], "values": [0.0]}],
+            initial={"position": {"swing": 0.5}},
+            solver={"integrator": method, "step": h, "engine": "smooth"},
+        )
+        problem = make_plan(scene).problem
+        curve = sine(a, w)
+        clip = Clip(problem.model, {"pivot": curve}, problem.state0.q)
+        v0 = np.array([a * w, 0.0])
+        problem = dataclasses.replace(
+            problem, clip=clip, state0=State(problem.state0.q, v0, problem.state0.act)
+        )
+        segment = SmoothEngine().run(problem, (0.0, 1.6), None)
+        errors.append(abs(segment.q[-1, 1] - truth))
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert order - 0.35 < slope < order + 1.5, errors
+
+
+@pytest.mark.parametrize("step", [0.002, 0.01, 0.05])
+def test_a_falling_joint_stops_at_its_limit_at_the_closed_form_time(tmp_path, step):
+    scene = scene_of(tmp_path, SLIDE, duration=1.0, solver={"step": step}, rate=100)
+    plan = make_plan(scene)
+    assert plan.engine.what == "smooth"
+    r = run(plan)
+    (hit,) = [e for e in r.events if e.kind == "limit"]
+    assert abs(hit.t - np.sqrt(2 * 0.5 / G)) < 1e-9
+    rest = r.t > hit.t
+    assert np.all(r.q[rest, 0] == -0.5)
+    assert np.all(r.v[rest] == 0.0)
+    assert np.all(r.a[rest] == 0.0)
+    assert r.q.min() >= -0.5
+
+
+def test_a_resting_joint_leaves_its_limit_when_it_is_pulled_off(tmp_path):
+    """2 kg on the lower limit, pushed up by a force that grows as 40 t: it leaves when 40 t = m g."""
+    scene = scene_of(
+        tmp_path,
+        SLIDE,
+        duration=1.2,
+        initial={"position": {"z": -0.5}},
+        keys=[{"actuator": "push", "times": [0.0, 2.0], "values": [0.0, 80.0], "curve": "linear"}],
+        solver={"step": 0.001},
+    )
+    r = run(scene)
+    (gone,) = [e for e in r.events if e.kind == "limit end"]
+    t0 = 2 * G / 40
+    assert t0 <= gone.t <= t0 + 0.0021
+    # m z'' = 40 (t - t0): z = -0.5 + 40 (t - t0)^3 / (6 m)
+    late = r.t > gone.t
+    np.testing.assert_allclose(r.q[late, 0], -0.5 + 40 * (r.t[late] - t0) ** 3 / 12, atol=1e-5)
+
+
+def test_an_impact_keeps_the_angular_momentum_of_a_floating_pair(tmp_path):
+    """Two bodies, one hinge with a limit, no gravity: the impact is internal, energy can only be lost."""
+    xml = """
+<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body name="hull"><freejoint/>
+  <geom type="box" size="0.2 0.1 0.1" mass="3" contype="0" conaffinity="0"/>
+  <body pos="0.2 0 0"><joint name="flap" axis="0 1 0" range="-0.4 0.4" limited="true"/>
+    <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.04" mass="1" contype="0" conaffinity="0"/>
+  </body></body>
+</worldbody></mujoco>"""
+    scene = scene_of(tmp_path, xml, duration=1.0, initial={"velocity": {"flap": 3.0}}, solver={"step": 0.002})
+    r = run(scene)
+    assert [e.kind for e in r.events][:1] == ["limit"]
+    d = mujoco.MjData(r.model)
+    momenta = []
+    for q, v in zip(r.q, r.v, strict=True):
+        d.qpos[:], d.qvel[:] = q, v
+        mujoco.mj_forward(r.model, d)
+        mujoco.mj_subtreeVel(r.model, d)
+        momenta.append(
+            np.concatenate([d.subtree_angmom[0], r.model.body_subtreemass[0] * d.subtree_linvel[0]])
+        )
+    np.testing.assert_allclose(momenta, np.tile(momenta[0], (len(momenta), 1)), atol=1e-9)
+    assert r.energy[-1] < 0.9 * r.energy[0]
+    assert np.all(np.diff(r.energy) < 1e-9)
+    assert np.all(np.abs(r.q[:, -1]) <= 0.4 + 1e-12)
+
+
+def test_dry_friction_stops_a_sliding_joint_where_coulomb_says(tmp_path):
+    """m = 2 kg, friction 3 N, 1.5 m/s: it stops after v^2 m / (2 F) = 0.75 m, in v m / F = 1 s."""
+    xml = SLIDE.replace('range="-0.5 2" limited="true"', 'frictionloss="3"').replace("0 0 -9.81", "0 0 0")
+    scene = scene_of(tmp_path, xml, duration=2.0, initial={"velocity": {"z": 1.5}}, solver={"step": 0.001})
+    plan = make_plan(scene)
+    assert plan.engine.what == "smooth"
+    assert any("smoothed below" in line for line in plan.left_out)
+    r = run(plan)
+    assert abs(r.q[-1, 0] - 0.75) < 0.02
+    assert abs(r.v[-1, 0]) < 1e-3
+    np.testing.assert_allclose(r.q[r.t < 0.9, 0], (1.5 * r.t - 0.75 * r.t**2)[r.t < 0.9], atol=2e-3)
+
+
+def test_adaptive_error_follows_the_tolerance():
+    """A pendulum from 120 degrees; its period is 4 sqrt(l/g) K(sin^2 60 deg)."""
+    errors = []
+    for tolerance in (1e-4, 1e-7, 1e-10):
+        scene = Scene(
+            duration=2.754089828887826,
+            models=[{"file": "pendulum"}],
+            angle="degree",
+            initial={"position": {"hinge": 120.0}},
+            physics={"friction": False, "limits": False},
+            solver={"tolerance": tolerance},
+        )
+        r = run(scene, error=True)
+        assert r.stats["integrator"] == "dopri5"
+        true = abs(r.q[-1, 0] - r.q[0, 0])
+        assert true <= 3 * r.error.angle[-1] + 1e-12
+        errors.append(true)
+    assert errors[0] > 30 * errors[1] > 900 * errors[2]
+
+
+def test_accelerations_and_forces_are_those_of_the_engines_own_physics():
+    scene = Scene(
+        duration=0.6,
+        models=[{"file": "arm6"}],
+        physics={"contacts": "none"},
+        roles={"tracked": ["shoulder", "elbow"]},
+        keys=[{"joint": "waist", "times": [0, 0.6], "values": [0, 0.8]}],
+    )
+    plan = make_plan(scene)
+    assert plan.engine.what == "smooth"
+    r = run(plan)
+    waist, others = 0, slice(1, 6)
+    np.testing.assert_allclose(r.a[:, waist], plan.problem.clip.evaluate(r.t).a[:, waist], atol=1e-12)
+    # v changes by the integral of a between samples, up to the held controls' jumps
+    change = np.diff(r.v[:, others], axis=0)
+    mean = 0.5 * (r.a[1:, others] + r.a[:-1, others]) * np.diff(r.t)[:, None]
+    assert np.abs(change - mean)[5:].max() < 0.02
+    # power of drives, friction, damping and gravity accounts for the energy
+    m = r.model
+    damping = np.array(m.dof_damping).reshape(m.nv, -1)[:, 0]
+    width = r.stats["friction_width"]
+    friction = m.dof_frictionloss * np.tanh(r.v / width)
+    power = ((r.tau - damping * r.v - friction) * r.v).sum(axis=1)
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (power[1:] + power[:-1]) * np.diff(r.t))])
+    assert np.abs(r.energy - r.energy[0] - work).max() < 0.02 * np.ptp(r.energy) + 0.02
+
+
+def test_interrupted_run_keeps_what_it_has():
+    scene = Scene(duration=5.0, models=[{"file": "double_pendulum"}], initial={"position": {"elbow": 1.0}})
+
+    def stop(t):
+        if t > 2.0:
+            raise KeyboardInterrupt
+
+    r = run(scene, progress=stop)
+    assert r.status == "interrupted"
+    assert 2.0 < r.t[-1] < 5.0
+    whole = run(scene)
+    np.testing.assert_array_equal(r.q, whole.q[: len(r.q)])
+
+
+def test_divergence_keeps_finite_samples(tmp_path):
+    xml = SLIDE.replace('range="-0.5 2" limited="true"', 'stiffness="1e6"')
+    scene = scene_of(
+        tmp_path,
+        xml,
+        duration=5.0,
+        initial={"position": {"z": 0.1}},
+        solver={"engine": "smooth", "step": 0.0005, "integrator": "rk4"},
+    )
+    problem = dataclasses.replace(make_plan(scene).problem, step=0.01)
+    segment = SmoothEngine().run(problem, (0.0, 5.0), None)
+    assert segment.status == "diverged"
+    assert "'z'" in segment.message
+    assert np.isfinite(segment.q).all()
+    assert 0 < len(segment.t) < 500
