@@ -148,7 +148,7 @@ class Clip:
                 fits, needs = False, "a FreeTrack of a position and a rotation curve"
             else:
                 p, r = track.position, track.rotation
-                fits = p is None or (p.dim == 3 and p.dof == 3)
+                fits = p is None or p.dim == 3
                 fits = fits and (r is None or isinstance(r, RotationCurve))
                 needs = "a position of three numbers and a RotationCurve"
         elif kind == _BALL:

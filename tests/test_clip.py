@@ -132,7 +132,12 @@ def test_all_tracks_that_do_not_fit_are_reported_at_once():
         "ball joint 'shoulder' needs a RotationCurve (keyed_rotation), not PolynomialCurve of 1",
         "free joint 'base' needs a FreeTrack of a position and a rotation curve, not RotationCurve of 4",
     ]
-    for track in (FreeTrack(position=number), FreeTrack(rotation=keyed([0], [[1, 0, 0, 0]]))):
+    plane = keyed([0], [[0, 0]])
+    for track in (
+        FreeTrack(position=number),
+        FreeTrack(position=plane),
+        FreeTrack(rotation=keyed([0], [[1, 0, 0, 0]])),
+    ):
         with pytest.raises(KeyingError, match="free joint 'base' needs a position of three numbers"):
             Clip(floating_arm(), {"base": track})
     with pytest.raises(KeyingError, match="hinge joint 'elbow' needs a curve of one number, not FreeTrack"):
