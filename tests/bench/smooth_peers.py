@@ -1,0 +1,141 @@
+"""Pinocchio beside the smooth engine: the same model written out as numbers, run in its own process."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+VENV = ROOT / ".bench" / "pinocchio"
+SOURCE = Path(__file__).parent / "peers" / "pinocchio.cpp"
+FLAGS = "-std=c++17 -O3 -march=native -DNDEBUG"
+FLAGS += " -DBOOST_MPL_LIMIT_LIST_SIZE=30 -DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"  # as its CMake files
+
+
+def program():
+    """The compiled timing program; a sentence saying why not when it cannot be had."""
+    binary = VENV / "timing"
+    if binary.exists() and binary.stat().st_mtime > SOURCE.stat().st_mtime:
+        return binary
+    if shutil.which("g++") is None:
+        return "absent: timing Pinocchio without Python takes a C++ compiler (g++), which is not here"
+    if not VENV.exists():
+        subprocess.run([sys.executable, "-m", "venv", VENV], check=True)
+        got = subprocess.run(
+            [VENV / "bin" / "python", "-m", "pip", "install", "-q", "pin"], capture_output=True
+        )
+        if got.returncode:
+            shutil.rmtree(VENV)
+            return "absent: `pip install pin` failed"
+    prefix = next(VENV.glob("lib/python*/site-packages/cmeel.prefix"), None)
+    import casadi
+
+    eigen = Path(casadi.__file__).parent / "include" / "eigen3"  # CasADi's package carries Eigen's headers
+    command = ["g++", *FLAGS.split(), f"-I{prefix}/include", f"-I{eigen}", SOURCE, "-o", binary]
+    command += [f"-L{prefix}/lib", "-lpinocchio_default", f"-Wl,-rpath,{prefix}/lib"]
+    print("compiling Pinocchio's timing program, once: a few minutes ...", flush=True)
+    built = subprocess.run(command, capture_output=True, text=True)
+    return binary if built.returncode == 0 else f"absent: {built.stderr.splitlines()[0][:200]}"
+
+
+def _turn(quat):
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, np.asarray(quat, float))
+    return R.reshape(3, 3)
+
+
+def _z_along(axis):
+    a = axis / np.linalg.norm(axis)
+    x = np.eye(3)[(int(np.argmax(np.abs(a))) + 1) % 3]
+    x = x - a * (a @ x)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(a, x), a])
+
+
+def _pose(R, p):
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R, p
+    return X
+
+
+def joints_of(model):
+    """(parent, kind, placement, mass, com, inertia about it) of every joint; hinges and slides along z."""
+    rows, frame = [], {0: (0, np.eye(4))}
+    for b in range(1, model.nbody):
+        parent, X = frame[model.body_parentid[b]]
+        X = X @ _pose(_turn(model.body_quat[b]), model.body_pos[b])
+        for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            kind = ("free", "ball", "slide", "hinge")[model.jnt_type[j]]
+            A = np.eye(4)
+            if kind == "free":
+                X = np.eye(4)
+            else:
+                R = _z_along(model.jnt_axis[j]) if kind in ("slide", "hinge") else np.eye(3)
+                A = _pose(R, model.jnt_pos[j])
+            rows.append([parent, kind, X @ A, 0.0, np.zeros(3), np.zeros((3, 3))])
+            parent, X = len(rows), np.linalg.inv(A)
+        frame[b] = parent, X
+        if parent:
+            _add_body(rows[parent - 1], model, b, X)
+    return rows
+
+
+def _add_body(row, model, b, X):
+    m, R = model.body_mass[b], X[:3, :3] @ _turn(model.body_iquat[b])
+    c = X[:3, :3] @ model.body_ipos[b] + X[:3, 3]
+    inertia = R @ np.diag(model.body_inertia[b]) @ R.T
+    total = row[3] + m
+    if total > 0:
+        mean = (row[3] * row[4] + m * c) / total
+        for mass, place in ((row[3], row[4]), (m, c)):
+            d = place - mean
+            inertia = inertia + mass * (d @ d * np.eye(3) - np.outer(d, d))
+        row[3], row[4], row[5] = total, mean, row[5] + inertia
+
+
+def _vectors(model, q, v, tau):
+    """State and force in Pinocchio's order and frames."""
+    q, v, tau = q.copy(), v.copy(), tau.copy()
+    for j in range(model.njnt):
+        at, dof, kind = model.jnt_qposadr[j], model.jnt_dofadr[j], model.jnt_type[j]
+        if kind == 0:
+            R = _turn(q[at + 3 : at + 7])
+            v[dof : dof + 3], tau[dof : dof + 3] = R.T @ v[dof : dof + 3], R.T @ tau[dof : dof + 3]
+            at += 3
+        if kind in (0, 1):
+            q[at : at + 4] = np.roll(q[at : at + 4], -1)
+    return q, v, tau
+
+
+def _acceleration(model, q, v, a):
+    """Accelerations back in MuJoCo's frames."""
+    a = a.copy()
+    for j in np.flatnonzero(model.jnt_type == 0):
+        at, dof = model.jnt_qposadr[j], model.jnt_dofadr[j]
+        R = _turn(q[at + 3 : at + 7])
+        w = v[dof + 3 : dof + 6]
+        a[dof : dof + 3] = R @ (a[dof : dof + 3] + np.cross(w, R.T @ v[dof : dof + 3]))
+    return a
+
+
+def pinocchio(binary, model, q, v, tau):
+    """(ns of a forward dynamics, ns of its derivatives, accelerations at the states)."""
+    rows = joints_of(model)
+    lines = [f"{len(rows)} {len(q)}", " ".join(map(repr, model.opt.gravity.tolist()))]
+    for parent, kind, X, m, c, inertia in rows:
+        numbers = [*X[:3, :3].ravel(), *X[:3, 3], m, *c, *inertia.ravel()]
+        lines.append(f"{parent} {kind} " + " ".join(repr(float(x)) for x in numbers))
+    for state in zip(q, v, tau, strict=True):
+        lines.append(" ".join(repr(float(x)) for part in _vectors(model, *state) for x in part))
+    path = VENV / "model.txt"
+    path.write_text("\n".join(lines))
+    out = subprocess.run([binary, path], capture_output=True, text=True, check=True).stdout.splitlines()
+    aba, derivatives = (float(line.split()[1]) for line in out[:2])
+    a = [
+        _acceleration(model, x, y, np.array(row.split(), float))
+        for x, y, row in zip(q, v, out[2:], strict=True)
+    ]
+    return aba, derivatives, np.array(a)
