@@ -233,6 +233,14 @@ def test_a_loop_steps_at_every_seam_however_late():
     np.testing.assert_array_equal(curve(turns * 0.3 + 0.1, left=True).q, 1)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_loop_closes_exactly_though_its_keys_do_within_rounding_only(shape):
+    curve = keyed([0, 1, 2], [0.3, 1, 0.3 + 1e-10], **shape, after="loop")
+    assert curve(2.0).q == curve(0.0).q == 0.3
+    if shape != {"kind": "step"}:
+        assert curve(2.0, left=True).q == pytest.approx(0.3, abs=1e-15)
+
+
 def test_one_key_is_a_constant_for_all_times():
     for shape in SHAPES:
         curve = keyed([2.0], [[3.0, 4.0]], **shape, before="loop", after="loop")
