@@ -12,7 +12,8 @@ from .problem import Problem
 
 Array = NDArray[np.float64]
 _LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
-_STALL = 12  # iterations without progress that end an attempt
+_STALL = 8  # iterations without progress that end an attempt
+_PROGRESS = 0.99
 
 
 class Descent(NamedTuple):
@@ -48,7 +49,7 @@ def descend(problem: Problem, q: Array, *, iterations: int = 100, first: bool = 
         w_k = problem.weighted(raw_k)
         cost_k = _square(w_k.r)
         better = cost_k < cost[k]
-        progress = cost_k < cost[k] * (1 - 1e-3)
+        progress = cost_k < _PROGRESS * cost[k]
         b = k[better]
         q[b], r[b], cost[b], w.r[b], w.J[b] = (
             trial[better], raw_k.r[better], cost_k[better], w_k.r[better], w_k.J[better],

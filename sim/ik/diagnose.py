@@ -52,6 +52,14 @@ def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
     return _together(problem, search, nearest)
 
 
+def excluded(problem: Problem, q: Array) -> bool:
+    """Whether lengths and limits prove, without any search, that the goals cannot be met."""
+    goals = problem.goals
+    return any(_exceeds(goal_gap(problem, g, q), g) for g in goals) or any(
+        _exceeds(pair_gap(problem, a, b, q), a, b) for a, b in pairs(goals)
+    )
+
+
 def _exceeds(gap: Gap, *goals: Goal) -> bool:
     """Whether a proved gap is larger than the goals' tolerances allow."""
     room = sum(float(np.linalg.norm(t[np.isfinite(t)])) for t in (g.tolerances() for g in goals))
@@ -106,9 +114,7 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
 
 def _proved_held(problem: Problem, search: Search) -> bool:
     """Whether the ranges of the joints prove that nothing inside them meets the goals."""
-    if any(_exceeds(goal_gap(problem, g, search.start), g) for g in problem.goals):
-        return True
-    if any(_exceeds(pair_gap(problem, a, b, search.start), a, b) for a, b in pairs(problem.goals)):
+    if excluded(problem, search.start):
         return True
     if closed_form_outside(problem, closed_form(problem, search.start)) is not None:
         return True

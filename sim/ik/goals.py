@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -161,6 +162,11 @@ class Orientation(Goal):
         super().__post_init__()
         object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
 
+    @cached_property
+    def back(self) -> Array:
+        """R_T^T (3, 3) of the target."""
+        return np.asarray(rotations.to_matrix(self.quat).T)
+
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
@@ -168,14 +174,13 @@ class Orientation(Goal):
         return ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
-        return _turn_rows(_seen_from(c, self.at, self.relative_to), np.asarray(self.quat))
+        return _turn_rows(_seen_from(c, self.at, self.relative_to), self.back)
 
 
-def _turn_rows(f: Moving, quat: Array) -> Rows:
-    """log(R_T^T R) in the target's axes; its derivative is J_left^-1 R_T^T w."""
-    R_T = rotations.to_matrix(quat)
-    phi = rotations.log(rotations.from_matrix(R_T.T @ f.R))
-    return Rows(phi, rotations.inverse_right_jacobian(-phi) @ (R_T.T @ f.Jw))
+def _turn_rows(f: Moving, back: Array) -> Rows:
+    """log(R_T^T R) in the target's axes, `back` = R_T^T; its derivative is J_left^-1 R_T^T w."""
+    phi = rotations.log(rotations.from_matrix(back @ f.R))
+    return Rows(phi, rotations.inverse_right_jacobian(-phi) @ (back @ f.Jw))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +197,11 @@ class Pose(Goal):
         object.__setattr__(self, "position", _vector("position", self.position))
         object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
 
+    @cached_property
+    def back(self) -> Array:
+        """R_T^T (3, 3) of the target."""
+        return np.asarray(rotations.to_matrix(self.quat).T)
+
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
@@ -200,7 +210,7 @@ class Pose(Goal):
 
     def rows(self, c: Configurations) -> Rows:
         f = _seen_from(c, self.at, self.relative_to)
-        turn = _turn_rows(f, np.asarray(self.quat))
+        turn = _turn_rows(f, self.back)
         return Rows(
             np.concatenate([f.p - self.position, turn.r], axis=1), np.concatenate([f.Jv, turn.J], axis=1)
         )

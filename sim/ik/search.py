@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,11 +22,20 @@ class Search:
     Attributes:
         best: the nearest ends so far, nearest first (at most 12).
         used, iterations: random starts and iterations so far.
-        ends: costs of all attempts that failed.
+            ends: costs of all attempts that failed.
+        hopeless: asked once after the first starts; if it says so, few more are tried, for the nearest pose.
     """
 
-    def __init__(self, problem: Problem, start: Array, *, restarts: int, seed: int):
-        self.problem, self.start, self.restarts = problem, start, restarts
+    def __init__(
+        self,
+        problem: Problem,
+        start: Array,
+        *,
+        restarts: int,
+        seed: int,
+        hopeless: Callable[[], bool] | None = None,
+    ):
+        self.problem, self.start, self.restarts, self.hopeless = problem, start, restarts, hopeless
         self.rng = np.random.default_rng(seed)
         self.used = self.iterations = 0
         self.ends: list[float] = []
@@ -48,7 +59,10 @@ class Search:
             starts = np.stack([self.start, space.middle(self.start, moved)])
             found.append(self._attempt(starts, iterations=40, first=not every))
         if every or not len(found[-1]):
-            found.append(self._raced(every=every))
+            if self.hopeless is not None and not every and self.hopeless():
+                self.restarts = min(self.restarts, sum(_BLOCKS[:2]))
+            else:
+                found.append(self._raced(every=every))
         blocks = iter(_BLOCKS)
         size = next(blocks)
         while self.used < self.restarts and (every or not sum(map(len, found))):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .closed_form import candidates
 from .descend import Descent, sharpen
-from .diagnose import diagnose
+from .diagnose import diagnose, excluded
 from .goals import Goal
 from .preferences import Preference, Wishes, preference
 from .problem import Problem, unwound
@@ -60,7 +60,7 @@ def solve(
     judged, wished = _parts(problem)
     prefers = preference(prefer, judged, start, obstacles)
     wish: Wish = prefers if wished is None else Wishes(wished, prefers)
-    search = Search(judged, start, restarts=restarts, seed=seed)
+    search = Search(judged, start, restarts=restarts, seed=seed, hopeless=lambda: excluded(judged, start))
     found = search.solutions(candidates(judged, start), every=all)
     if len(found):
         best = _settled(judged, space, found, wish, start, every=all)
