@@ -56,6 +56,7 @@ def _easing(pieces: Sequence[Any], inner_knots: Sequence[float] = ()) -> Easing:
     for k, p in enumerate(pieces):
         local = p(Polynomial([knots[k], 1.0])).coef
         coefficients[degree + 1 - len(local) :, k] = local[::-1]
+    coefficients[-1, 0] = 0.0  # e(0) = 0 exactly, so that curves meet their keys
     knots.setflags(write=False)
     coefficients.setflags(write=False)
     return Easing(knots, coefficients)
