@@ -56,3 +56,25 @@ def _link(parent, name, pos, quat, limits):
     )
     body.add_geom(size=[0.03, 0, 0], mass=1.0, contype=0, conaffinity=0)
     return body
+
+
+def chain_spec(frame, model):
+    """The chain of a frame (`pantograph.sim.kinematics`) alone: hinges about z with their limits, and `tip`."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    body = spec.worldbody
+    for i, joint in enumerate(frame.joints):
+        limits = model.jnt_range[model.dof_jntid[joint.v]] - joint.rest
+        body = _link(body, f"link{i + 1}", joint.X[:3, 3], _quat(joint.X), limits)
+    body.add_site(name="tip", pos=frame.X_end[:3, 3], quat=_quat(frame.X_end))
+    return spec
+
+
+def bare(frame, model):
+    return chain_spec(frame, model).compile()
+
+
+def _quat(X):
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(X[:3, :3]).ravel())
+    return quat

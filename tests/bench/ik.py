@@ -1,0 +1,294 @@
+"""Inverse kinematics: speed and success on three arms beside mink and pink, and verdicts against known truths.
+
+`make bench NAME=ik`, or `python tests/bench/ik.py [part ...]` with parts protocol, verdicts, motion, loops.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from arms import bare, panda, ur5  # noqa: E402
+from oracles import ik_cases  # noqa: E402
+from pantograph.models import data_robots, load_model  # noqa: E402
+from pantograph.sim.ik import ChainSolver, solve  # noqa: E402
+from pantograph.sim.kinematics import frame  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import track  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+BUDGET = 5e-3  # [s], of the TRAC-IK protocol; of processor time, so that other work on the machine does not count
+TOLERANCE = 1e-5
+RANDOM_TARGETS, PEER_TARGETS, CASES = 10_000, 200, 1000
+ENVIRONMENT = HERE.parents[1] / ".bench" / "ik"
+PACKAGES = ("mink", "pin-pink", "daqp", "qpsolvers", "mujoco>=4")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number and the bar it must reach (None: told, not judged)."""
+
+    name: str
+    value: float
+    unit: str
+    bar: str
+    holds: bool | None
+
+
+def at_most(name, value, bar, unit):
+    return Figure(name, float(value), unit, f"<= {bar:g}", bool(value <= bar))
+
+
+def at_least(name, value, bar, unit):
+    return Figure(name, float(value), unit, f">= {bar:g}", bool(value >= bar))
+
+
+def told(name, value, unit):
+    return Figure(name, float(value), unit, "", None)
+
+
+# Targets.
+
+
+def questions():
+    """Arms with targets: name, model with one chain to `tip`, R (k, 3, 3), p (k, 3), the configurations."""
+    folder = next((p.parents[2] / "references" for p in data_robots().values()), None)
+    model = panda()
+    if folder is not None and (folder / "panda_targets.csv").is_file():
+        rows = np.loadtxt(folder / "panda_targets.csv", delimiter=",", comments="#")
+        yield "Panda, given targets", model, rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12]
+    else:
+        yield "Panda, random targets", model, *random_targets(model, 2000)
+    yield "UR5", ur5(), *random_targets(ur5(), RANDOM_TARGETS)
+    if "wx250s" in data_robots():
+        arm = bare(frame(load_model("wx250s"), "body", "wx250s/gripper_link"), load_model("wx250s"))
+        yield "wx250s", arm, *random_targets(arm, RANDOM_TARGETS)
+
+
+def random_targets(model, k):
+    q = np.random.default_rng(12).uniform(*model.jnt_range.T, (k, model.nq))
+    X = frame(model, "site", "tip").pose(q)
+    return X[:, :3, :3], X[:, :3, 3]
+
+
+def worst_error(model, q, R, p):
+    """Largest component of position and rotation error, by MuJoCo's own kinematics."""
+    data, worst = mujoco.MjData(model), np.zeros(len(q))
+    for i, x in enumerate(q):
+        data.qpos[:] = x
+        mujoco.mj_kinematics(model, data)
+        E = data.site("tip").xmat.reshape(3, 3) @ R[i].T
+        quat, turn = np.empty(4), np.empty(3)
+        mujoco.mju_mat2Quat(quat, E.ravel())
+        mujoco.mju_quat2Vel(turn, quat, 1.0)
+        worst[i] = max(np.abs(data.site("tip").xpos - p[i]).max(), np.abs(turn).max())
+    return worst
+
+
+# The TRAC-IK protocol.
+
+
+def ours(model, R, p, rounds=3):
+    """Seconds (k,), answers (k, n) and whether they are right within the budget; the median round."""
+    arm = ChainSolver(model, "tip")
+    for i in range(20):
+        arm(R[i], p[i], tolerance=TOLERANCE)
+    runs = []
+    for _ in range(rounds):
+        seconds, q = np.empty(len(p)), np.empty((len(p), model.nq))
+        for i in track(range(len(p)), "our solver", transient=True):
+            begin = time.thread_time()
+            q[i] = arm(R[i], p[i], tolerance=TOLERANCE, most=20_000).q[0]
+            seconds[i] = time.thread_time() - begin
+        runs.append((seconds, q))
+    seconds, q = sorted(runs, key=lambda run: run[0].mean())[rounds // 2]
+    low, high = model.jnt_range.T
+    right = (worst_error(model, q, R, p) <= TOLERANCE * (1 + 1e-9)) & ((q >= low) & (q <= high)).all(axis=1)
+    return seconds, right & (seconds <= BUDGET), right
+
+
+def plain(model, R, p, budget):
+    """A plain damped least squares on MuJoCo's Jacobian with random restarts, in Python."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    low, high = model.jnt_range.T
+    J, seconds, met = np.empty((6, model.nv)), np.empty(len(p)), np.zeros(len(p), dtype=bool)
+    site, quat, turn = data.site("tip"), np.empty(4), np.empty(3)
+    for i in range(len(p)):
+        begin = time.thread_time()
+        q, best, stalled = 0.5 * (low + high), np.inf, 0
+        while True:
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mju_mat2Quat(quat, (site.xmat.reshape(3, 3) @ R[i].T).ravel())
+            mujoco.mju_quat2Vel(turn, quat, 1.0)
+            e = np.concatenate([site.xpos - p[i], turn])
+            error, seconds[i] = np.abs(e).max(), time.thread_time() - begin
+            if error <= TOLERANCE or seconds[i] > budget:
+                break
+            best, stalled = (error, 0) if error < 0.9 * best else (best, stalled + 1)
+            if stalled >= 10:
+                q, best, stalled = rng.uniform(low, high), np.inf, 0
+                continue
+            mujoco.mj_jacSite(model, data, J[:3], J[3:], site.id)
+            q = np.clip(q - J.T @ np.linalg.solve(J @ J.T + (1e-6 + 1e-2 * e @ e) * np.eye(6), e), low, high)
+        met[i] = error <= TOLERANCE and seconds[i] <= budget
+    return seconds, met
+
+
+def peer(name, model, R, p, budget, folder):
+    """mink or pink in their own environment; None when they cannot be had."""
+    path, targets, result = folder / "arm.xml", folder / "targets.npz", folder / f"{name}.npz"
+    mujoco.mj_saveLastXML(str(path), model) if not path.is_file() else None
+    np.savez(targets, R=R, p=p, tolerance=TOLERANCE)
+    command = [ENVIRONMENT / "bin" / "python", HERE / "peers" / "ik_peers.py", name, path, targets]
+    done = subprocess.run([*command, str(budget * 1e3), result], capture_output=True, text=True, check=False)
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1] if done.stderr else "failed"
+    data = np.load(result)
+    return data["seconds"], data["met"]
+
+
+def environment():
+    """Make the peers' environment when it is not there; a reason why not, or None."""
+    if (ENVIRONMENT / ".done").is_file():
+        return None
+    subprocess.run([sys.executable, "-m", "venv", ENVIRONMENT], check=True)
+    done = subprocess.run(
+        [ENVIRONMENT / "bin" / "python", "-m", "pip", "install", "--quiet", *PACKAGES],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1]
+    (ENVIRONMENT / ".done").touch()
+    return None
+
+
+def protocol(console):
+    """Success within the budget, mean and 99th percentile of time, ours and peers on the same targets."""
+    import tempfile
+
+    absent = environment()
+    table = Table(title=f"TRAC-IK protocol: {TOLERANCE:g} in every component, from mid-range, {BUDGET * 1e3:g} ms")
+    for column in ("arm", "solver", "targets", "solved in 5 ms", "mean", "median", "99 %", "solved in 100 ms"):
+        table.add_column(column, justify="left" if column in ("arm", "solver") else "right")
+    figures = []
+    for name, model, R, p in questions():
+        seconds, met, right = ours(model, R, p)
+        us = seconds * 1e6
+        table.add_row(name, "Pantograph", str(len(p)), f"{100 * met.mean():.3f} %", f"{us.mean():.1f} us",
+                      f"{np.median(us):.1f} us", f"{np.percentile(us, 99):.1f} us", f"{100 * right.mean():.3f} %")  # fmt: skip
+        figures += [
+            at_least(f"{name}: solved in 5 ms", met.mean(), 0.9999, "share"),
+            at_most(f"{name}: mean time", us.mean(), 100, "us"),
+            at_most(f"{name}: 99th percentile", np.percentile(us, 99), 1000, "us"),
+        ]
+        few = slice(0, PEER_TARGETS)
+        s, m = plain(model, R[few], p[few], BUDGET)
+        _, late = plain(model, R[few], p[few], 0.1)
+        rows = [("damped least squares", (s, m), late)]
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "arm.xml").write_text(model_xml(model))
+            for solver in ("mink", "pink"):
+                if absent:
+                    rows.append((solver, f"absent: {absent}", None))
+                    continue
+                quick = peer(solver, model, R[few], p[few], BUDGET, Path(folder))
+                slow = quick if isinstance(quick, str) else peer(solver, model, R[few], p[few], 0.1, Path(folder))
+                rows.append((solver, slow if isinstance(slow, str) else quick, None if isinstance(slow, str) else slow))
+        for solver, quick, slow in rows:
+            if isinstance(quick, str):
+                table.add_row("", solver, quick)
+                continue
+            t, m = quick
+            t_late, m_late = (t, slow) if isinstance(slow, np.ndarray) else slow
+            us = t_late * 1e6
+            table.add_row("", solver, str(len(t)), f"{100 * m.mean():.1f} %", f"{us.mean():.0f} us",
+                          f"{np.median(us):.0f} us", f"{np.percentile(us, 99):.0f} us", f"{100 * m_late.mean():.1f} %")  # fmt: skip
+            figures.append(told(f"{name}: {solver} solved in 5 ms", m.mean(), "share"))
+            figures.append(told(f"{name}: {solver} mean over ours", us.mean() / (seconds.mean() * 1e6), "ratio"))
+    console.print(table)
+    return figures
+
+
+def model_xml(model):
+    """The bare arm as MJCF: the same file for every peer."""
+    spec = bare_spec(model)
+    spec.compile()
+    return spec.to_xml()
+
+
+def bare_spec(model):
+    from arms import chain_spec
+
+    return chain_spec(frame(model, "site", "tip"), model)
+
+
+# Verdicts.
+
+FAMILIES = {"reachable": ik_cases.REACHABLE, "out of reach": ik_cases.BEYOND, "beyond a limit": ik_cases.LIMITED,
+            "conflict": ik_cases.CONFLICT}  # fmt: skip
+
+
+def judge(job):
+    """Mistakes of one case, the seconds, and whether a negative verdict is proved."""
+    group, index = job
+    families = FAMILIES[group]
+    rng = np.random.default_rng([index, *group.encode()])
+    case = families[index % len(families)](rng)
+    begin = time.thread_time()
+    solution = solve(case.model, case.goals)
+    seconds = time.thread_time() - begin
+    return case.family, ik_cases.mistakes(case, solution), seconds, solution.verdict.proved
+
+
+def verdicts(console):
+    """A thousand questions of each kind whose truth is known by construction."""
+    table = Table(title="Verdicts")
+    for column in ("truth", "cases", "wrong", "proved", "median", "slowest"):
+        table.add_column(column, justify="right")
+    figures, total = [], 0
+    with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for group in FAMILIES:
+            jobs = [(group, i) for i in range(CASES)]
+            answers = list(track(pool.map(judge, jobs, chunksize=10), group, total=CASES, transient=True))
+            wrong = [a for a in answers if a[1]]
+            for family, mistakes, *_ in wrong[:5]:
+                console.print(f"wrong: {family}: {'; '.join(mistakes)}")
+            times = np.array([a[2] for a in answers])
+            total += len(wrong)
+            table.add_row(group, str(CASES), str(len(wrong)), f"{100 * np.mean([a[3] for a in answers]):.1f} %",
+                          f"{np.median(times) * 1e3:.0f} ms", f"{times.max() * 1e3:.0f} ms")  # fmt: skip
+            figures.append(told(f"wrong verdicts, {group}", len(wrong), f"of {CASES}"))
+    console.print(table)
+    return [*figures, at_most("wrong verdicts", total / (CASES * len(FAMILIES)), 1e-3 * (1 - 1e-9), "share")]
+
+
+PARTS = {"protocol": protocol, "verdicts": verdicts}
+
+
+def main():
+    console = Console()
+    chosen = sys.argv[1:] or list(PARTS)
+    figures = [figure for part in chosen for figure in PARTS[part](console)]
+    table = Table(title="Figures")
+    for column in ("figure", "value", "unit", "bar", "holds"):
+        table.add_column(column)
+    for f in figures:
+        table.add_row(f.name, f"{f.value:.6g}", f.unit, f.bar, "" if f.holds is None else "yes" if f.holds else "NO")
+    console.print(table)
+    print(json.dumps({f.name: asdict(f) for f in figures}))
+    sys.exit(0 if all(f.holds is not False for f in figures) else 1)
+
+
+if __name__ == "__main__":
+    main()
