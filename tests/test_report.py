@@ -172,7 +172,7 @@ def test_a_free_scene_is_a_case(tmp_path):
 def test_a_scene_with_a_controller_runs_on_both_engines(tmp_path):
     """The engines hold the same samples: errors fall with the order, and the physics agree."""
     (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
-    result = report(tmp_path / "tracked.toml", budget_s=0.01)
+    result = report(tmp_path / "tracked.toml", budget_s=0.03)
     assert {r.engine for r in result.rows} == {"smooth", "contact"}
     for engine in ("smooth", "contact"):
         rows = [r for r in result.rows if r.engine == engine and r.method == "rk4"]
