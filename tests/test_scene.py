@@ -169,7 +169,7 @@ def test_files_are_looked_for_beside_the_scene(tmp_path):
 
 words = st.from_regex(r"[a-z][a-z0-9_-]{0,5}", fullmatch=True)
 values = st.sampled_from(
-    ["1", '"# [x] = 1"', "'[[y]]'", "[1, 2]", "[\n  [1], # ]\n  2,\n]", "{ a = 1 }", '"""\n[t]\nk = 1\n"""']
+    ["1", '"# [x] = 1"', "'[[y]]'", "[1, 2]", "[\n  [1], # ]\n  [2]\n]", "{ a = 1 }", '"""\n[t]\nk = 1\n"""']
 )
 
 
