@@ -98,6 +98,30 @@ def test_upright_pendulum_on_shaken_pivot_is_stable_above_the_kapitza_threshold_
         assert largest > 1.0
 
 
+@pytest.mark.parametrize("engine", ["contact", "smooth"])
+@pytest.mark.parametrize("time", [0.5, 0.5007])
+def test_a_pivot_that_starts_at_once_kicks_the_pendulum(tmp_path, engine, time):
+    """Linear keys jump in velocity: the hanging bob stays where it is, so theta' = -V / l afterwards."""
+    file = tmp_path / "pivot.xml"
+    file.write_text(PIVOT.format(axis="1 0 0"))
+    scene = Scene(
+        duration=1.0,
+        rate=500,
+        models=[{"file": str(file)}],
+        keys=[
+            {"joint": "pivot", "times": [0.0, time, 1.5], "values": [0.0, 0.0, 1.5 - time], "curve": "linear"}
+        ],
+        solver={"engine": engine, "step": 0.002, "integrator": "rk4"},
+    )
+    r = run(scene)
+    np.testing.assert_allclose(r.q[r.t < time, 1], 0.0, atol=1e-12)
+    # seen from the moving pivot: theta' = -1 at theta = 0, kept energy afterwards
+    after = r.t > time + 0.004
+    kept = 0.5 * r.v[after, 1] ** 2 + G * (1 - np.cos(r.q[after, 1]))
+    np.testing.assert_allclose(kept, 0.5, atol=1e-6)
+    assert r.v[after, 1][0] < -0.99
+
+
 def test_recorded_drive_force_is_what_inverse_dynamics_asks_for(tmp_path):
     problem = pivot_problem(tmp_path, sine(0.3, 4.0), axis="1 0 0", angle=0.5, duration=1.0, step=0.002)
     problem = dataclasses.replace(problem, sample_every=10)

@@ -78,6 +78,7 @@ class _Run:
         self.data = mujoco.MjData(self.model)
         self.timed = Timed(problem)
         self.chunk_first = -1
+        self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
         self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
         self.quat = _quaternion_joints(self.model)
         self.evaluations = 0
@@ -139,7 +140,19 @@ class _Run:
             return
         advance = self._runge_kutta if self.problem.integrator == "rk4" else self._native
         for step in range(k, k + n):
+            if step in self.jumps:
+                self._jump(step)
             advance(step)
+
+    def _jump(self, k: int) -> None:
+        """Velocities that keyed joints take up at once pull the others along: M_pp dv_p = -M_pk dv_k."""
+        d, p = self.data, self.prescriber
+        mujoco.mj_fwdPosition(self.model, d)
+        impulse, dv = np.zeros((1, self.model.nv)), np.zeros((1, self.model.nv))
+        impulse[0, p.keyed] = p.armature * self.jumps[k]
+        mujoco.mj_solveM(self.model, d, dv, impulse)
+        dv[0, p.keyed] = 0.0
+        d.qvel[:] += dv[0]
 
     def _inputs(self, k: int) -> tuple[tuple[TimedInputs, TimedInputs, TimedInputs], int]:
         """Prescribed inputs at the start, the middle and the end of a chunk of steps, and the row of step

@@ -108,6 +108,7 @@ class _Run:
             )
         self.timed = Timed(problem)
         self.limits = limits_of(problem)
+        self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
         self.resting: tuple[Limit, ...] = ()
         self.compiled: dict[tuple[Limit, ...], Compiled] = {}
         self.q, self.v, self.act = (np.array(x, dtype=float) for x in problem.state0)
@@ -182,7 +183,18 @@ class _Run:
         stops = [self.steps - k, CHUNK]
         if self.per_tick:
             stops.append(self.per_tick - k % self.per_tick)
+        stops += [at - k for at in self.jumps if at > k]
         return min(stops)
+
+    def _jump(self, k: int) -> None:
+        """Velocities that keyed joints take up at once pull the others along: M_pp dv_p = -M_pk dv_k."""
+        m, c = self.problem.model, self.model()
+        data, M = mujoco.MjData(m), np.zeros((m.nv, m.nv))
+        data.qpos[:] = self.q
+        mujoco.mj_forward(m, data)
+        mujoco.mj_fullM(m, data, M)
+        pulled = M[np.ix_(c.v_free, self.timed.keyed)] @ self.jumps[k]
+        self.v[c.v_free] -= np.linalg.solve(M[np.ix_(c.v_free, c.v_free)], pulled)
 
     def _stop_at(self, k: int) -> None:
         if k == self.steps:
@@ -198,6 +210,8 @@ class _Run:
 
     def _advance(self, k: int, n: int) -> int:
         """Integrate ``n`` steps from step ``k``, or fewer when a joint meets or leaves a limit."""
+        if k in self.jumps:
+            self._jump(k)
         self._release(k)
         q, v, act = self._roll(k * self.h, self.h, n)
         last = self._first_event(k, q, v, act)

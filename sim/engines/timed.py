@@ -48,6 +48,22 @@ class Timed:
         """Whether nothing depends on time, so that steps need no Python between them."""
         return not (len(self.keyed) or len(self.servos) or len(self.bodies))
 
+    def jumps(self, t0: float, step: float, steps: int) -> dict[int, Array]:
+        """Jumps (k,) of keyed velocities, as at the keys of linear curves, by the step that begins with them.
+
+        A jump within a step acts at the next one's start.
+        """
+        found: dict[int, Array] = {}
+        times = self.clip.breaks_between(t0, t0 + steps * step)
+        if not len(times) or not len(self.keyed):
+            return found
+        before, after = self.at(times, left=True), self.at(times)
+        for time, jump, speed in zip(times, after.v - before.v, np.abs(after.v), strict=True):
+            if np.any(np.abs(jump) > 1e-9 * (1.0 + speed)):
+                k = int(np.ceil((time - t0) / step - 1e-6))
+                found[k] = found.get(k, 0.0) + jump
+        return found
+
     def at(self, t: NDArray[np.floating], *, left: bool = False) -> TimedInputs:
         """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
         times: Array = np.asarray(t, dtype=np.float64)
