@@ -5,18 +5,14 @@ B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), eq. 8.51.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models import name_of
 from ..sim.control import Target
-from ..sim.errors import PantographError, unknown
+from .gains import Gain, felt_inertia, per_joint, positive
 
 Array = NDArray[np.float64]
-Gain = float | Mapping[str, float]
 
 
 class PD:
@@ -40,15 +36,18 @@ class PD:
         kd: Gain | None = None,
         gravity: bool = True,
     ) -> None:
-        for what, value in (("frequency", frequency), ("damping", damping)):
-            if not (isinstance(value, int | float) and np.isfinite(value) and value > 0):
-                raise PantographError(f"the PD law's {what} must be a positive number, got {value!r}")
+        positive("the PD law's frequency", frequency)
+        positive("the PD law's damping", damping)
         self.model, self.tracked, self.gravity = model, tracked, gravity
         self.data = mujoco.MjData(model)
-        inertia = _felt_inertia(model, q0)
+        inertia = felt_inertia(model, q0)
         w = 2.0 * np.pi * frequency
-        self.kp = inertia * w**2 if kp is None else _gains(model, "kp", kp)
-        self.kd = 2.0 * damping * np.sqrt(self.kp * inertia) if kd is None else _gains(model, "kd", kd)
+        self.kp = inertia * w**2 if kp is None else per_joint(model, "the PD law's kp", kp)
+        self.kd = (
+            2.0 * damping * np.sqrt(self.kp * inertia)
+            if kd is None
+            else per_joint(model, "the PD law's kd", kd)
+        )
 
     def start(self) -> None:
         """No memory."""
@@ -75,27 +74,3 @@ class PD:
             mujoco.mj_passive(m, d)
             weight -= d.qfrc_gravcomp
         return weight
-
-
-def _felt_inertia(model: mujoco.MjModel, q0: Array) -> Array:
-    data = mujoco.MjData(model)
-    data.qpos[:] = q0
-    mujoco.mj_forward(model, data)
-    inverse = np.eye(model.nv)
-    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
-    return np.asarray(1.0 / np.diag(inverse))
-
-
-def _gains(model: mujoco.MjModel, what: str, gain: Gain) -> Array:
-    out = np.zeros(model.nv)
-    if not isinstance(gain, Mapping):
-        gain = {"": gain}
-    names = {name_of(model, "joint", j): j for j in range(model.njnt)}
-    for name, value in gain.items():
-        if not (isinstance(value, int | float) and np.isfinite(value) and value >= 0):
-            raise PantographError(f"the PD law's {what} must be a number >= 0, got {value!r}")
-        if name and name not in names:
-            raise PantographError(f"the PD law's {what}: {unknown('joint', name, names)}")
-        dofs = model.dof_jntid == names[name] if name else np.ones(model.nv, dtype=bool)
-        out[dofs] = value
-    return out

@@ -85,7 +85,7 @@ def _controls(plan: Plan) -> Controls | None:
     if plan.period is None:
         return None
     item = plan.setup.scene.controller
-    law = make_law(item.law if item else "pd", plan.problem, item.parameters if item else {})
+    law = make_law(item.law if item else "pd", plan.problem, item.parameters if item else {}, plan.period)
     return Sampled(law, plan.problem, plan.period)
 
 

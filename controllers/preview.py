@@ -1,0 +1,40 @@
+"""Where the keys will be: targets of a clip on the grid of a controller, evaluated once for all samples."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sim.clip import Clip
+from ..sim.control import Target
+
+Array = NDArray[np.float64]
+
+
+class Preview:
+    """Targets of ``clip`` at times (k + ``offset``) ``period`` [s], k = 0, 1, ... up to ``duration`` [s]."""
+
+    def __init__(self, clip: Clip, period: float, duration: float, *, offset: float = 0.5) -> None:
+        self.clip, self.period, self.duration, self.offset = clip, period, duration, offset
+
+    @cached_property
+    def times(self) -> Array:
+        """All times of the grid [s]."""
+        ticks = max(1, int(np.ceil(self.duration / self.period - 1e-9)))
+        return np.asarray((np.arange(ticks) + self.offset) * self.period, dtype=np.float64)
+
+    @cached_property
+    def targets(self) -> Target:
+        """Targets at all times: q (ticks, nq), v and a (ticks, nv)."""
+        return Target(*self.clip.evaluate(self.times))
+
+    def at(self, t: float) -> Target:
+        """The target ``offset`` periods after ``t`` [s]: from the grid where ``t`` is a tick of it."""
+        tick = t / self.period
+        k = round(tick)
+        if abs(tick - k) > 1e-6 or not 0 <= k < len(self.times):
+            return Target(*self.clip.evaluate(t + self.offset * self.period))
+        q, v, a = self.targets
+        return Target(q[k], v[k], a[k])
