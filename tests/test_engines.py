@@ -206,7 +206,7 @@ def test_prescribed_accelerations_equal_the_reduced_equations(tree):
     scale = 1.0 + np.abs(a).max()
     np.testing.assert_allclose(data.qacc, a, atol=1e-9 * scale)
     if len(k):
-        np.testing.assert_allclose(prescriber.lag, drive, atol=1e-7 * (1.0 + np.abs(drive).max()))
+        np.testing.assert_allclose(prescriber.drive, drive, atol=1e-7 * (1.0 + np.abs(drive).max()))
 
 
 def test_satellite_with_a_keyed_arm_keeps_its_angular_momentum(tmp_path):
@@ -399,14 +399,15 @@ def test_kinematic_engine_returns_the_keys_without_dynamics():
     np.testing.assert_array_equal(r.q, motion.q)
     np.testing.assert_array_equal(r.v, motion.v)
     np.testing.assert_allclose(r.a, motion.a, atol=1e-9)
-    # its drive forces are MuJoCo's inverse dynamics of the model as filed
+    # its drive forces are MuJoCo's inverse dynamics of the model as filed, and dry friction
     m = plan.setup.as_filed
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     d = mujoco.MjData(m)
     for i in range(0, len(r.t), 25):
         d.qpos[:], d.qvel[:], d.qacc[:] = r.q[i], r.v[i], motion.a[i]
         mujoco.mj_inverse(m, d)
-        np.testing.assert_allclose(r.tau[i], d.qfrc_inverse, atol=1e-7)
+        friction = m.dof_frictionloss * np.sign(r.v[i])
+        np.testing.assert_allclose(r.tau[i], d.qfrc_inverse + friction, atol=1e-7)
 
 
 def test_divergence_is_reported_with_time_joint_and_cause_and_keeps_finite_samples(tmp_path):

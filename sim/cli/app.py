@@ -55,6 +55,14 @@ def run(
     error: Annotated[
         bool, typer.Option("--error", help="Estimate the error by a run at half the step.")
     ] = False,
+    mirror: Annotated[
+        str | None, typer.Option(help="Rig file, or name of one that comes along, to play the motion on.")
+    ] = None,
+    port: Annotated[
+        str | None, typer.Option(help="Mirror: serial device in place of the rig's, or 'virtual'.")
+    ] = None,
+    slow: Annotated[bool, typer.Option("--slow", help="Mirror: slow the motion down until it fits.")] = False,
+    stop: Annotated[str, typer.Option(help="Mirror: how the rig is left: hold, park or limp.")] = "hold",
 ) -> None:
     """Run a scene; its recording is always saved."""
     from ..plan import make_plan
@@ -70,6 +78,8 @@ def run(
     console.print(f"recording: {saved}")
     _draw(recording, film, plot, out)
     _finish(recording)
+    if mirror is not None:
+        _mirror(recording, mirror, port, slow, stop, out / f"{scene.stem}-rig.npz")
 
 
 @app.command(epilog="Example: pantograph plan wave.toml")
@@ -169,6 +179,16 @@ def schema() -> None:
     from ..scene.schema import Scene
 
     typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
+
+
+def _mirror(recording: Any, rig: str, port: str | None, slow: bool, stop: str, path: Path) -> None:
+    from ...hardware.cli import play_recording
+
+    report = play_recording(recording, rig, port=port, slow=slow, stop=stop)
+    if report.recording is not None:
+        console.print(f"the rig's recording: {report.recording.save(path)}")
+    if report.status != "done":
+        raise typer.Exit(130 if report.status == "interrupted" else 1)
 
 
 def _draw(recording: Any, film_path: Path | None, plot_path: Path | None, out: Path) -> None:

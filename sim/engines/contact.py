@@ -202,10 +202,10 @@ class _Run:
         d.qfrc_applied[:] = self.held.qfrc
         a_key = (end.v[row] - begin.v[row]) / h
         if len(p.keyed):
-            d.qfrc_applied[p.keyed] = p.armature * a_key + p.lag
+            p.push(d, a_key)
         mujoco.mj_step(self.model, d)
         if len(p.keyed):
-            p.lag = p.lag + p.armature * (a_key - d.qacc[p.keyed])
+            p.observe(d)
         self.evaluations += 1
         self._land(k + 1)
 

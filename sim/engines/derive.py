@@ -65,12 +65,20 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
             apply_wrenches(p.model, d, timed, inputs.wrench[i])
             p.settle(d, qfrc, inputs.a[i])
             a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
-            tau[i, p.keyed] = p.lag
+            tau[i, p.keyed] = p.drive
             now, normal[i] = _active(p.model, d)
             events += _changes(segment.t[i], touching, now)
             touching = now
         kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
+    tau[:, p.keyed] += dry_friction(m)[p.keyed] * np.sign(segment.v[:, p.keyed])
     return Derived(a, tau, ctrl, kinetic, potential, normal, (*events, *segment.events))
+
+
+def dry_friction(model: mujoco.MjModel) -> Array:
+    """Dry friction (nv,) [N, N m] that is part of the scene's physics; a drive has to overcome it."""
+    off = int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    loss = np.array(model.dof_frictionloss, dtype=float)
+    return np.zeros_like(loss) if model.opt.disableflags & off else loss
 
 
 def apply_wrenches(model: mujoco.MjModel, data: mujoco.MjData, timed: Timed, wrench: Array) -> None:

@@ -1,10 +1,9 @@
 """Keyed joints inside MuJoCo: prescribed acceleration with the right inertial forces on everything else.
 
-A keyed degree of freedom gets a large armature A and the force A a_key + lag. It then accelerates
-with a_key up to (forces on it) / A, and the rest of the mechanism, contacts included, feels a body that
-nothing can push. ``lag`` collects A (a_key - a) after each evaluation, which removes that remainder; at
-its fixed point lag is the torque that a drive would need for the keyed motion:
-M a + bias = passive + constraint + lag on the keyed rows.
+A keyed degree of freedom gets a large armature A and the force A a_key + drive. It then accelerates with
+a_key up to (forces on it - drive) / A, and the rest of the mechanism, contacts included, feels a body that
+nothing can push. ``drive`` is what inverse dynamics asked for at the evaluation before, so that the remainder
+is a change of forces over one evaluation, divided by A: M a + bias = passive + actuation + constraint + drive.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from numpy.typing import NDArray
 
 from .interface import Array
 
-# Armature relative to the joint's own inertia: large enough that one correction leaves about 1e-14 of
-# the acceleration, small enough that MuJoCo's constraint solver keeps its digits (gradient noise
-# about A * 1e-16 of the inertia).
+# Armature relative to the joint's own inertia: large enough that forces move a keyed joint by 1e-7 of what they
+# would otherwise, small enough that MuJoCo's constraint solver keeps its digits (gradient noise about
+# A * 1e-16 of the inertia).
 STIFFNESS = 1e7
 
 
@@ -39,7 +38,7 @@ class Prescriber:
     def __init__(self, model: mujoco.MjModel, keyed: NDArray[np.bool_]) -> None:
         self.keyed = np.flatnonzero(keyed)
         self.model = copy.copy(model)
-        self.lag = np.zeros(len(self.keyed))
+        self.drive = np.zeros(len(self.keyed))
         if not len(self.keyed):
             return
         data = mujoco.MjData(model)
@@ -55,6 +54,7 @@ class Prescriber:
         mujoco.mj_setConst(m, mujoco.MjData(m))
         # the solver scales its tolerance by this; the added armature is no inertia of the scene
         m.stat.meaninertia = mean_inertia
+        self._inertial = np.zeros(m.nv)
 
     def forward(self, data: mujoco.MjData, qfrc: Array, a_key: Array) -> None:
         """``mj_forward`` with joint forces ``qfrc`` (nv,) and keyed accelerations ``a_key`` (k,)."""
@@ -62,19 +62,26 @@ class Prescriber:
         if not len(self.keyed):
             mujoco.mj_forward(self.model, data)
             return
-        k = self.keyed
-        data.qfrc_applied[k] = self.armature * a_key + self.lag
+        self.push(data, a_key)
         mujoco.mj_forward(self.model, data)
-        self.lag = self.lag + self.armature * (a_key - data.qacc[k])
+        self.observe(data)
+
+    def push(self, data: mujoco.MjData, a_key: Array) -> None:
+        """Write the forces that make the keyed joints accelerate with ``a_key`` (k,)."""
+        data.qfrc_applied[self.keyed] = self.armature * a_key + self.drive
+
+    def observe(self, data: mujoco.MjData) -> None:
+        """Take ``drive`` from the accelerations and forces of an evaluation."""
+        k = self.keyed
+        mujoco.mj_mulM(self.model, data, self._inertial, data.qacc)
+        self.drive = (self._inertial[k] - self.armature * data.qacc[k]) + (
+            data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator - data.qfrc_constraint
+        )[k]
 
     def settle(self, data: mujoco.MjData, qfrc: Array, a_key: Array) -> None:
-        """As :meth:`forward`, repeated until the keyed accelerations are met: afterwards ``lag`` is the
-        required drive force (k,) [N or N m]."""
-        if not len(self.keyed):
-            self.forward(data, qfrc, a_key)
-            return
+        """As :meth:`forward`, repeated until the keyed accelerations are met: afterwards ``drive`` (k,) is
+        the force [N, N m] that the keyed motion needs."""
         for _ in range(4):
             self.forward(data, qfrc, a_key)
-            error = np.abs(data.qacc[self.keyed] - a_key)
-            if np.all(error <= 1e-12 * (1.0 + np.abs(a_key))):
+            if np.all(np.abs(data.qacc[self.keyed] - a_key) <= 1e-12 * (1.0 + np.abs(a_key))):
                 break
