@@ -219,14 +219,16 @@ class Bounds:
 
 
 def make_bounds(rig: Rig) -> Bounds:
-    """Limits of the servos: those of the rig file, else the factory limits of the model."""
+    """Limits of the servos: those of the rig file, else what the model's factory limits and its motor allow."""
     from .registers import control_table
 
     unit, rows = rig.unit, []
     for s in rig.servos:
         table, motor = control_table(s.model), MOTORS[control_table(s.model).model]
         limit = table["velocity_limit"]
-        fastest = limit.to_si(limit.default) if limit.default else motor.no_load_speed
+        fastest = motor.no_load_speed
+        if limit.default:
+            fastest = min(fastest, limit.to_si(limit.default))
         current_share = 1.0 if s.current is None else min(1.0, s.current / motor.stall_current)
         low, high = (table[n] for n in ("min_position_limit", "max_position_limit"))
         rows.append(

@@ -215,6 +215,19 @@ def test_short_replies_do_not_raise_index_errors() -> None:
     assert driver.statistics.strays > 0
 
 
+def test_index_errors_of_the_sdk_are_broken_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver, _, _ = pinged(1)
+    real, failures = driver._handler.rxPacket, iter([True, False, False])
+
+    def odd(port, fast):
+        if next(failures):
+            raise IndexError("list index out of range")
+        return real(port, fast)
+
+    monkeypatch.setattr(driver._handler, "rxPacket", odd)
+    assert abs(driver.read(1, "present_position") - 0.1) < 1e-3
+
+
 def test_a_port_that_raised_can_be_used_again() -> None:
     driver, bus, _ = pinged(1, faults=FaultPlan(cable=(CablePull(1.0, 2.0),)))
     bus.advance_to(1.5)

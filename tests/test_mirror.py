@@ -122,9 +122,12 @@ def test_targets_beyond_soft_limits_and_nonsense_are_kept_off_the_wire() -> None
     rig, bus, plants = make_rig()
     session = session_of(rig, bus)
     at = session.mapping.servo(START)
-    outcome = session.run(at, lambda t: at + 50.0, 3.0)
-    assert max(p.path[-1] for p in plants) < np.pi + 0.01
-    assert outcome.log.clamped > 0
+    far = session.mapping.servo(START + np.array([50.0, 0.0]))
+    outcome = session.run(at, lambda t: far, 3.0)
+    assert outcome.status == "done" and outcome.log.clamped > 0
+    assert (np.array(outcome.log.goal) <= session.bounds.high + 1e-12).all()
+    assert session.bounds.high[0] == 1.5  # the joint's soft limit, not the servo's
+    assert max(p.path[-1] for p in plants[:2]) < 1.52
     rig, bus, _ = make_rig()
     session = session_of(rig, bus)
     outcome = session.run(at, lambda t: np.full(3, np.nan), 1.0)
@@ -155,6 +158,24 @@ def test_ctrl_c_stops_as_promised(where: str, stop: str) -> None:
     if stop == "park":
         pose = session.mapping.joint(np.array([p.path[-1] for p in plants]))
         assert np.allclose(pose, [-0.2, 0.1], atol=0.03)
+
+
+def test_a_hold_stops_where_the_servos_are_not_where_they_were_going() -> None:
+    rig, bus, plants = make_rig()
+    session = session_of(rig, bus)
+    at = session.mapping.servo(START)
+
+    def target(t: float) -> np.ndarray:
+        if t > 0.4:
+            raise KeyboardInterrupt
+        return at + session.mapping.matrix @ np.array([2.0, 0.0]) * t
+
+    outcome = session.run(at, target, 1.0)
+    behind = abs(outcome.log.goal[-1][0] - plants[0].path[-1])
+    assert behind > 0.06  # what it had yet to go
+    stopped = plants[0].path[-1]
+    bus.advance(1.0)
+    assert abs(plants[0].path[-1] - stopped) < 0.4 * behind
 
 
 def test_an_exception_of_the_caller_stops_the_rig_and_goes_on() -> None:

@@ -292,7 +292,7 @@ def test_slowed_motion_fits_and_a_little_faster_does_not(seed: int) -> None:
     rng = np.random.default_rng(seed)
     motion = swing(rng.uniform(2, 8), rng.uniform(0.1, 1.0))
     n = len(motion.t)
-    gravity, damping, inertia = rng.uniform(0, 1.5), rng.uniform(0, 0.3), rng.uniform(0, 0.4)
+    gravity, damping, inertia = rng.uniform(-1.5, 1.5), rng.uniform(0, 0.3), rng.uniform(0, 0.4)
     limit = bounds(
         rng.uniform(0.5, 5), rng.uniform(1, 30), rng.uniform(1, 3), rng.uniform(1, 3), rng.uniform(3, 9)
     )

@@ -167,12 +167,7 @@ def _lead(
         goal[to] = np.clip(q[of], bounds.low[to], bounds.high[to])
         return mapping.servo(goal)
 
-    begun = [np.nan]
-
     def target(t: float) -> Array:
-        if np.isnan(begun[0]):  # the leader's clock went on during the ramp
-            begun[0] = hand.driver.clock.now()
-            hand.begin = begun[0]
         return follow(read(t))
 
     try:
