@@ -34,16 +34,21 @@ def start_anywhere(scene, seed):
     return dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, state0=state))
 
 
-@given(st.sampled_from(sorted(MODELS)), st.integers(0, 10**6), st.sampled_from(["rk4", "euler", "implicit"]))
-@settings(max_examples=25)
-def test_the_estimate_is_near_the_true_error_of_smooth_motion(name, seed, integrator):
+@given(
+    st.sampled_from(sorted(MODELS)),
+    st.integers(0, 10**6),
+    st.sampled_from(["rk4", "euler", "implicit"]),
+    st.sampled_from(["auto", "contact"]),
+)
+@settings(max_examples=30)
+def test_the_estimate_is_near_the_true_error_of_smooth_motion(name, seed, integrator, engine):
     step = 0.01 if integrator == "rk4" else 0.001
     scene = Scene(
         duration=1.0,
         rate=20,
         models=[MODELS[name]],
         physics=SMOOTH,
-        solver={"step": step, "integrator": integrator},
+        solver={"step": step, "integrator": integrator, "engine": engine},
     )
     plan = start_anywhere(scene, seed)
     r = run(plan, error=True)
@@ -51,13 +56,27 @@ def test_the_estimate_is_near_the_true_error_of_smooth_motion(name, seed, integr
     assert r.error.order == (4 if integrator == "rk4" else 1)
     assert r.error.trusted_until == np.inf
     assert r.error.evaluations == 2 * r.stats["evaluations"]
+    assert_near_the_truth(plan, r)
+
+
+def assert_near_the_truth(plan, r):
+    """Estimates within a fifth of the true errors, down to what the reference itself can tell."""
     s = plan.problem.state0
     truth = motion(plan.problem.model, s.q, s.v, r.t)
     for estimate, error in zip((r.error.angle, r.error.length), difference(r.model, r.q, truth), strict=True):
-        # extrapolation is exact up to a relative error of O(step), from rounding upwards
         assert estimate.shape == r.t.shape
         assert np.max(estimate) <= 1.2 * np.max(error) + 1e-9
         assert np.max(error) <= 1.2 * np.max(estimate) + 1e-9
+
+
+@given(st.sampled_from(["double_pendulum", "cart_pole"]), st.integers(0, 10**6), st.floats(3.0, 6.0))
+@settings(max_examples=15)
+def test_the_estimate_of_adaptive_steps_is_near_the_true_error(name, seed, digits):
+    scene = Scene(
+        duration=1.0, rate=20, models=[MODELS[name]], physics=SMOOTH, solver={"tolerance": 10**-digits}
+    )
+    plan = start_anywhere(scene, seed)
+    assert_near_the_truth(plan, run(plan, error=True))
 
 
 @given(st.sampled_from([0.02, 0.01]), st.integers(0, 10**6))

@@ -9,8 +9,18 @@ import pytest
 from oracles import pendulum
 from pantograph.sim.errors import EngineError
 from pantograph.sim.hard_cases import HARD_CASES
+from pantograph.sim.plan import make_plan
 from pantograph.sim.report import Report, Yardstick, report
-from pantograph.sim.work_precision import Case, Row, runners, smooth_or_none, smooth_reference
+from pantograph.sim.scene.load import load_scene
+from pantograph.sim.scene_work import scene_case, scene_references, scene_runners
+from pantograph.sim.work_precision import (
+    Case,
+    Row,
+    runners,
+    smooth_or_none,
+    smooth_reference,
+    trajectory_error,
+)
 
 PENDULUM = """<mujoco><worldbody><body><joint axis="0 -1 0"/>
 <inertial pos="0 0 -1" mass="1" diaginertia="1e-14 1e-14 1e-14"/></body></worldbody></mujoco>"""
@@ -41,8 +51,6 @@ def test_errors_are_those_of_the_closed_form():
     case = swing()
     exact = pendulum.swing(case.times, 2.0)[:, 0]
     reference = smooth_reference(case, smooth_or_none(case.model)[0])
-    from pantograph.sim.work_precision import trajectory_error
-
     seen = set()
     for runner in runners(case, smooth_or_none(case.model)[0], ("smooth", "mujoco", "scipy")):
         setting = list(runner.settings())[3]
@@ -172,15 +180,30 @@ def test_a_free_scene_is_a_case(tmp_path):
 def test_a_scene_with_a_controller_runs_on_both_engines(tmp_path):
     """The engines hold the same samples: errors fall with the order, and the physics agree."""
     (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
-    result = report(tmp_path / "tracked.toml", budget_s=0.03)
+    plan = make_plan(load_scene(tmp_path / "tracked.toml"))
+    case = scene_case(plan)
+    found, notes = scene_runners(plan, case)
+    assert not notes and {runner.engine for runner in found} == {"smooth", "contact"}
+    references = scene_references(("smooth", "contact"), plan, case, budget_s=0.2)
+    for runner in found:
+        if runner.method == "rk4":
+            coarse, fine = list(runner.settings())[:2]
+            assert coarse == 0.01, "the controller's period"
+            motion = references[runner.engine].motion
+            ratio = trajectory_error(case, runner.run(coarse), motion) / trajectory_error(
+                case, runner.run(fine), motion
+            )
+            assert ratio > 10, "order 4"
+    assert max(reference.uncertainty for reference in references.values()) < 1e-6
+    assert trajectory_error(case, references["smooth"].motion, references["contact"].motion) < 1e-6
+
+
+def test_report_on_a_scene_with_a_controller(tmp_path):
+    (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
+    result = report(tmp_path / "tracked.toml", budget_s=0.0)
     assert {r.engine for r in result.rows} == {"smooth", "contact"}
-    for engine in ("smooth", "contact"):
-        rows = [r for r in result.rows if r.engine == engine and r.method == "rk4"]
-        assert rows[0].setting == 0.01
-        assert rows[1].error < rows[0].error / 10, "order 4"
-        assert result.uncertainty(engine) < 1e-6
-    apart = next(float(note.split("lie ")[1].split()[0]) for note in result.notes if "lie" in note)
-    assert apart < 1e-6
+    assert {y.engine for y in result.yardsticks} == {"smooth", "contact"}
+    assert any("physics of the two engines" in note for note in result.notes)
 
 
 def test_unknown_engines_are_named():

@@ -1,4 +1,5 @@
 import _thread
+import dataclasses
 import sys
 import threading
 import time
@@ -9,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.sim import Scene, load, make_plan, run
-from pantograph.sim.engines.contact import ContactEngine
 from scenes import numbers, scenes
 
 FALL = {"duration": 2.0, "models": [{"file": "double_pendulum"}], "initial": {"position": {"shoulder": 2.0}}}
@@ -45,8 +45,8 @@ def test_two_runs_are_equal_to_the_last_bit(data):
     assert one.events == two.events
 
 
-@given(st.sampled_from([FALL, TRACKED]), st.integers(1, 200))
-@settings(max_examples=20)
+@given(st.sampled_from([FALL, {**FALL, "solver": {"engine": "contact"}}, TRACKED]), st.integers(1, 200))
+@settings(max_examples=25)
 def test_an_interrupted_run_keeps_the_beginning_of_the_whole_one(tmp_path_factory, data, calls):
     whole = run(Scene(**data))
     left = calls
@@ -74,8 +74,9 @@ def test_an_interrupted_run_keeps_the_beginning_of_the_whole_one(tmp_path_factor
 
 
 @pytest.mark.parametrize("after", [0.05, 0.2, 0.35])
-def test_an_interrupt_at_any_moment_of_the_simulation_is_kept(after):
-    scene = Scene(**{**FALL, "duration": 1e4}, rate=1.0)
+@pytest.mark.parametrize("engine", ["contact", "auto"])
+def test_an_interrupt_at_any_moment_of_the_simulation_is_kept(after, engine):
+    scene = Scene(**{**FALL, "duration": 1e5}, rate=1.0, solver={"engine": engine})
     started = threading.Event()
 
     def interrupt():
@@ -89,7 +90,7 @@ def test_an_interrupt_at_any_moment_of_the_simulation_is_kept(after):
     thread.join()
     assert r.status == "interrupted"
     assert len(r.t) == len(r.q) == len(r.a) > 0
-    assert r.t[-1] < 1e4
+    assert r.t[-1] < 1e5
 
 
 @pytest.mark.parametrize("late", ["derive", "check_frames", "estimate_error"])
@@ -112,23 +113,19 @@ def test_an_interrupt_after_the_simulation_loses_no_motion(late, monkeypatch):
     assert any("interrupted" in note for note in r.notes) == (late != "estimate_error")
 
 
-def test_an_interrupt_of_the_second_run_gives_no_estimate(monkeypatch):
-    module = sys.modules[run.__module__]
-    runs = []
+@pytest.mark.parametrize("solver", [{"engine": "contact"}, {}, {"tolerance": 1e-6}])
+def test_an_interrupt_of_the_second_run_gives_no_estimate(monkeypatch, solver):
+    module, plan = sys.modules[run.__module__], make_plan(Scene(**FALL, solver=solver))
+    engine, runs = type(module.make_engine(plan.engine.what)), []
 
-    class Interrupted(ContactEngine):
-        def run(self, problem, t_span, controls, *, progress=None):
-            runs.append(problem.step)
-
-            def stop(t):
-                if len(runs) == 2 and t > 1.0:
-                    raise KeyboardInterrupt
-
-            return super().run(problem, t_span, controls, progress=stop)
+    class Interrupted(engine):
+        def run(self, *args, **options):
+            runs.append(super().run(*args, **options))
+            return runs[-1] if len(runs) == 1 else dataclasses.replace(runs[-1], status="interrupted")
 
     monkeypatch.setattr(module, "make_engine", lambda _: Interrupted())
-    r = run(Scene(**FALL), error=True)
-    assert runs == [0.002, 0.001]
+    r = run(plan, error=True)
+    assert len(runs) == 2
     assert r.status == "interrupted"
     assert r.error is None
     assert r.t[-1] == pytest.approx(2.0)

@@ -42,7 +42,7 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
     p = Prescriber(m, problem.dofs(Role.KEYED))
     p.model.opt.timestep = problem.step
     d, plain = mujoco.MjData(p.model), mujoco.MjData(m)
-    timed = Timed(problem)
+    timed, friction = Timed(problem), dry_friction(m)[p.keyed]
     inputs = timed.at(segment.t)
     a, tau, ctrl = np.zeros((n, m.nv)), np.zeros((n, m.nv)), np.zeros((n, m.nu))
     kinetic, potential, normal = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -65,12 +65,11 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
             apply_wrenches(p.model, d, timed, inputs.wrench[i])
             p.settle(d, qfrc, inputs.a[i])
             a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
-            tau[i, p.keyed] = p.drive
+            tau[i, p.keyed] = p.drive + friction * np.sign(segment.v[i, p.keyed])
             now, normal[i] = _active(p.model, d)
             events += _changes(segment.t[i], touching, now)
             touching = now
         kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
-    tau[:, p.keyed] += dry_friction(m)[p.keyed] * np.sign(segment.v[:, p.keyed])
     return Derived(a, tau, ctrl, kinetic, potential, normal, (*events, *segment.events))
 
 

@@ -35,6 +35,7 @@ ROLLOUT_BARS = {  # one state, batch of 4096: steps per second and core over muj
     "quadruped": (4.5, 14),
     "humanoid": (3.5, 12),
 }
+SPAN = 5.0  # of the motions whose error is bought [s]
 DERIVATIVE_BARS = {"ur5": 8, "panda": 3, "quadruped": 2.5, "humanoid": 1}
 
 
@@ -228,8 +229,8 @@ def to_an_error():
         model = models.stripped(models.load(name))
         smooth = compile_model(model)
         q, v = np.linspace(0.5, 1.5, model.nq), np.zeros(model.nv)
-        times = np.linspace(0.0, 2.0, 41)
-        exact = smooth.rollout(q, v, step=2.5e-4, steps=8000, every=200, method=TABLEAUS["verner98"]).q
+        times = np.linspace(0.0, SPAN, 101)
+        exact = smooth.rollout(q, v, step=SPAN / 2e4, steps=20000, every=200, method=TABLEAUS["verner98"]).q
         check = smooth.integrate(q, v, times, method=TABLEAUS["dop853"], rtol=1e-13, atol=1e-13).q
         theirs = _mujoco_costs(model, q, v, exact)
         ours = _our_costs(smooth, q, v, times, exact)
@@ -270,16 +271,16 @@ def _mujoco_costs(model, q, v, exact):
     start = np.concatenate([[0.0], q, v])[None]
     for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST", "RK4", "DISCRETE"):
         model.opt.integrator = int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}"))
-        for steps in 40 * 2 ** np.arange(0, 12):  # MuJoCo records every step
-            if integrator != "RK4" and steps > 40 * 2**10:
+        for steps in 100 * 2 ** np.arange(0, 12):  # MuJoCo records every step
+            if integrator != "RK4" and steps > 100 * 2**10:
                 continue
-            model.opt.timestep = 2.0 / steps
+            model.opt.timestep = SPAN / steps
             data = mujoco.MjData(model)
 
             def call(data=data, steps=steps):
                 return rollout(model, data, start, nstep=steps, control=None)[0]
 
-            path = call()[0, steps // 40 - 1 :: steps // 40, 1 : 1 + model.nq]
+            path = call()[0, steps // 100 - 1 :: steps // 100, 1 : 1 + model.nq]
             error = np.abs(path - exact[1:]).max()
             out.append((f"MuJoCo {integrator} {steps} steps", error, _cpu(call, rounds=3)))
             if error < 1e-10:
@@ -290,10 +291,10 @@ def _mujoco_costs(model, q, v, exact):
 def _our_costs(smooth, q, v, times, exact):
     out = []
     for name, method in TABLEAUS.items():
-        for steps in 40 * 2 ** np.arange(0, 10) if method.order > 2 else ():
+        for steps in 100 * 2 ** np.arange(0, 10) if method.order > 2 else ():
 
             def fixed(method=method, n=int(steps)):
-                return smooth.rollout(q, v, step=2.0 / n, steps=n, every=n // 40, method=method)
+                return smooth.rollout(q, v, step=SPAN / n, steps=n, every=n // 100, method=method)
 
             out.append((f"{name} {steps} steps", np.abs(fixed().q - exact).max(), _cpu(fixed)))
         for exponent in range(-13, -3) if method.adaptive and method.order > 3 else ():
