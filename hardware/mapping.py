@@ -219,7 +219,7 @@ class Bounds:
 
 
 def make_bounds(rig: Rig) -> Bounds:
-    """Limits of the servos: those of the rig file, else what the model's factory limits and its motor allow."""
+    """Limits of the servos: the rig file's, else what the factory limits and the motor allow."""
     from .registers import control_table
 
     unit, rows = rig.unit, []
