@@ -142,6 +142,21 @@ def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
     return Descent(x, raw.r, np.array([cost]), done, problem.met(raw.r))
 
 
+def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
+    """q (nq,) after Gauss-Newton steps of least norm without damping, while these bring judged rows nearer."""
+    x = q[None]
+    w = problem.weighted(problem.raw(x))
+    for _ in range(steps):
+        J, _ = held_projection(problem, x, np.zeros((1, problem.space.nv)), w.J)
+        d = -np.linalg.lstsq(J[0], w.r[0], rcond=1e-9)[0]
+        trial = problem.space.step(x, d[None])
+        w_trial = problem.weighted(problem.raw(trial))
+        if not np.abs(w_trial.r).max(initial=0.0) < np.abs(w.r).max(initial=0.0):
+            break
+        x, w = trial, w_trial
+    return np.asarray(x[0])
+
+
 def _hessian(problem: Problem, q: Array, free: NDArray[np.intp]) -> Array:
     """Second derivative (k, k) of half the cost along the freedoms `free`."""
     h, k = 1e-5, len(free)

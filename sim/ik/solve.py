@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .closed_form import candidates
-from .descend import Descent, sharpen
+from .descend import Descent, sharpen, tighten
 from .diagnose import diagnose, excluded
 from .goals import Goal
 from .preferences import Preference, Wishes, preference
@@ -105,7 +105,7 @@ def _settled(judged: Problem, space: Space, found: Array, wish: Wish, start: Arr
     settled = []
     for i in np.argsort(value, kind="stable")[: None if every else 3]:
         end = settle(judged, found[i], wish)
-        settled.append((end.value, unwound(judged, end.q[None], start)[0]))
+        settled.append((end.value, unwound(judged, tighten(judged, end.q)[None], start)[0]))
     settled.sort(key=lambda pair: pair[0])
     return distinct(space, np.array([q for _, q in settled]))
 

@@ -1,0 +1,183 @@
+"""Differential inverse kinematics, one tick at a time: a quadratic programme within limits and clear of geoms.
+
+    least  sum w |J d + r|^2 + damping |d|^2   over the step d = v dt
+    with   joint ranges with room to brake, |v| <= v_max, |v - v_before| <= a_max dt,
+           n^T J d >= -share (distance - clearance)  for every named pair of geoms (velocity damper,
+           Faverjon & Tournassoud 1987)
+
+A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick has
+a velocity that does, too, so that ranges, velocities and accelerations never contradict each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ModelError
+from .collision import Clearance
+from .goals import Goal
+from .pose import Kinematics
+from .problem import Problem, freedom_names
+from .qp import minimise
+from .solve import residuals
+from .space import Space
+from .verdict import Residual
+
+Array = NDArray[np.float64]
+_HARD = 1e4  # weight of hard goals and loops over wishes of weight 1
+_DAMPING = 1e-8
+_SHARE = 0.5  # of the distance to a geom that a tick may use up
+_SLACK = 1e6
+_ITERATIONS = 3  # linearisations a tick
+
+
+@dataclass(frozen=True)
+class Tick:
+    """State after one tick.
+
+    Attributes:
+        q (nq,), v (nv,): configuration and velocity over the tick.
+        residuals: of every goal there.
+        followed: all judged goals are within their tolerance.
+        held: what kept it back: names of joints at a limit of range, velocity or acceleration, and pairs of
+            geoms; empty when nothing did.
+    """
+
+    q: Array
+    v: Array
+    residuals: tuple[Residual, ...]
+    followed: bool
+    held: tuple[str, ...]
+
+
+class Follower:
+    """Follows goals that change from tick to tick, as in teleoperation.
+
+    Args:
+        model: constant.
+        dt: of a tick [s].
+        q0: start (nq,); default the model's qpos0.
+        velocity, acceleration: limits (nv,) or one for all [rad/s or m/s, and per s]; None for no limit.
+        joints: names of the joints that may move; default all that the goals depend on.
+        apart: pairs of geoms that keep `clearance` [m].
+
+    Raises ModelError for limits that are not positive.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        dt: float,
+        q0: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        joints: Sequence[str] | None = None,
+        apart: Sequence[tuple[str, str]] = (),
+        clearance: float = 0.01,
+    ):
+        self.model, self.dt, self.joints = model, dt, joints
+        self.space, self.kinematics = Space(model), Kinematics(model)
+        self.q = self.space.check(model.qpos0 if q0 is None else q0)
+        self.v: Array = np.zeros(model.nv)
+        self.v_max, self.a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
+        self.clearance = clearance
+        self.apart = Clearance(model, apart, reach=10 * clearance + 0.1) if apart else None
+        self.names = [f"{a} near {b}" for a, b in apart]
+
+    def step(self, goals: Sequence[Goal]) -> Tick:
+        """Move one tick towards `goals`."""
+        problem = Problem(self.model, goals, self.space, joints=self.joints, kinematics=self.kinematics)
+        columns = np.flatnonzero(problem.moved)
+        before, low, high = self.q, *self._box()
+        d: Array = np.zeros(self.model.nv)
+        for _ in range(_ITERATIONS):
+            d, held = self._programme(problem, columns, d, low, high)
+            self.q = self.space.step(before[None], d[None])[0]
+            after = problem.raw(self.q[None]).r
+            if problem.met(after)[0] or (held and self.apart is not None):
+                break
+        self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
+        met = bool(problem.met(after)[0])
+        return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
+
+    def _programme(
+        self, problem: Problem, columns: NDArray[np.intp], d: Array, low: Array, high: Array
+    ) -> tuple[Array, tuple[str, ...]]:
+        """Step (nv,) better than `d`, by the quadratic programme at q + d, and what holds it."""
+        w = problem.weighted(problem.raw(self.q[None]))
+        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
+        r, J = w.r[0] * weight, w.J[0][:, columns] * weight[:, None]
+        A, b, names = self._walls(columns)
+        n, k = len(columns), len(b)
+        H = np.zeros((n + k, n + k))
+        H[:n, :n] = J.T @ J + _DAMPING * _HARD * np.eye(n)
+        H[n:, n:] = _SLACK * np.eye(k)
+        g = np.concatenate([J.T @ r + _DAMPING * _HARD * d[columns], np.zeros(k)])
+        eye = np.eye(n + k)
+        rows = np.concatenate([eye[:n], -eye[:n], np.concatenate([A, -np.eye(k)], axis=1), -eye[n:]])
+        room = np.concatenate([(high - d)[columns], (d - low)[columns], b, np.zeros(k)])
+        bounded = np.isfinite(room)
+        found = minimise(H, g, rows[bounded], room[bounded])
+        out = d.copy()
+        out[columns] = np.clip(d[columns] + found.x[:n], low[columns], high[columns])
+        return out, self._held(columns, np.flatnonzero(bounded)[list(found.active)], n, names)
+
+    def _box(self) -> tuple[Array, Array]:
+        """Least and greatest step (nv,) that ranges, velocities and accelerations allow."""
+        x = np.zeros(self.space.nv)
+        x[self.space.scalar_v] = self.q[self.space.scalar_q]
+        return step_box(self.space.low - x, self.space.high - x, self.v, self.v_max, self.a_max, self.dt)
+
+    def _walls(self, columns: NDArray[np.intp]) -> tuple[Array, Array, list[str]]:
+        """Rows A d <= b that keep geoms apart, for pairs near enough to matter."""
+        if self.apart is None:
+            return np.zeros((0, len(columns))), np.zeros(0), []
+        gaps = self.apart.gaps(self.q)
+        near = [(gap, name) for gap, name in zip(gaps, self.names, strict=True) if np.any(gap.J)]
+        A = np.array([-gap.J[columns] for gap, _ in near]).reshape(-1, len(columns))
+        b = np.array([_SHARE * (gap.distance - self.clearance) for gap, _ in near])
+        return A, b, [name for _, name in near]
+
+    def _held(self, columns: NDArray[np.intp], active: NDArray[np.intp], n: int, names: list[str]) -> tuple[str, ...]:
+        mask = np.zeros(self.model.nv, dtype=bool)
+        mask[columns[active[active < 2 * n] % n]] = True
+        walls = active[(active >= 2 * n) & (active < 2 * n + len(names))] - 2 * n
+        return (*freedom_names(self.model, mask), *(names[i] for i in walls))
+
+
+def limit(name: str, value: ArrayLike | None, nv: int) -> Array:
+    """A limit for every freedom (nv,), infinite without one."""
+    out = np.broadcast_to(np.asarray(np.inf if value is None else value, dtype=float), (nv,)).copy()
+    if not (out > 0).all():
+        raise ModelError(f"limits of {name} must be positive; this has {out.min()}")
+    return out
+
+
+def step_box(below: Array, above: Array, v: Array, v_max: Array, a_max: Array, dt: float) -> tuple[Array, Array]:
+    """Least and greatest step (nv,) with limits `below` <= 0 <= `above` away (see the module's text)."""
+
+    def braking(room: Array) -> Array:
+        room = np.maximum(room, 0.0)
+        bounded = np.isfinite(a_max) & np.isfinite(room)
+        a, s = np.where(bounded, a_max, 1.0), np.where(bounded, room, 0.0)
+        speed = a * (np.sqrt(dt * dt + 2 * s / a) - dt)
+        return np.where(bounded, speed, room / dt)
+
+    high = np.minimum(np.minimum(v_max, v + a_max * dt), braking(above))
+    low = np.maximum(np.maximum(-v_max, v - a_max * dt), -braking(-below))
+    empty = low > high  # only after a change from outside: then ranges come first
+    middle = np.clip(np.where(empty, 0.5 * (low + high), 0.0), -braking(-below), braking(above))
+    return np.where(empty, middle, low) * dt, np.where(empty, middle, high) * dt
+
+
+def frozen(x: Array) -> Array:
+    """A read-only copy."""
+    out = x.copy()
+    out.setflags(write=False)
+    return out

@@ -1,0 +1,237 @@
+"""Inverse kinematics along time: a joint motion that follows goals over a whole clip.
+
+The smoothest motion near the goals is found at once for all instants t_k (sequential quadratic programming):
+
+    least  sum |r_k / tolerance|^2 + sum |(q_k+1 - 2 q_k + q_k-1) / (dt^2 a)|^2
+    with   joint ranges, |q_k+1 - q_k| <= v_max dt, |q_k+1 - 2 q_k + q_k-1| <= a_max dt^2
+
+whose matrices are banded, so that the cost grows linearly with the number of instants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..clip import Clip, FreeTrack, Track
+from ..curves import keyed
+from ..errors import ModelError
+from ..kinds import BALL, FREE
+from ..rotation_curves import keyed_rotation
+from ...models.naming import name_of
+from .band import Limits, smoothest_step
+from .follow import Follower, frozen, limit
+from .goals import Goal
+from .pose import Kinematics
+from .problem import Problem
+from .solve import residuals, solve
+from .space import Space
+from .verdict import Residual, Verdict
+
+Array = NDArray[np.float64]
+Goals = Callable[[float], Sequence[Goal]]
+_TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference acceleration
+_REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
+_STARTS = 6
+
+
+@dataclass(frozen=True)
+class Missed:
+    """A stretch of time in which goals were not followed, with the worst instant and why."""
+
+    start: float
+    end: float
+    worst: float
+    position: float
+    rotation: float
+    verdict: Verdict | None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Joint motion along goals.
+
+    Attributes:
+        t (k,), q (k, nq), v (k, nv), a (k, nv): instants, configurations, and velocities and accelerations by
+            central differences.
+        position, rotation (k,): deviation from the judged goals [m], [rad].
+        missed: stretches where they are not within tolerance; a verdict where the goals themselves cannot be
+            met there, none where limits of velocity or acceleration are the reason.
+        speed, effort: largest |velocity| and |acceleration| over their limits; 0 without limits.
+    """
+
+    model: mujoco.MjModel
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    position: Array
+    rotation: Array
+    missed: tuple[Missed, ...]
+    speed: float
+    effort: float
+
+    @property
+    def followed(self) -> bool:
+        """Whether the goals were within tolerance at every instant."""
+        return not self.missed
+
+    def clip(self) -> Clip:
+        """The motion as a clip: curves through all instants, of every joint that moves."""
+        model, tracks = self.model, dict[str, Track]()
+        for j in range(model.njnt):
+            q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+            wide = {FREE: 7, BALL: 4}.get(kind, 1)
+            if np.ptp(self.q[:, q : q + wide], axis=0).max() < 1e-12:
+                continue
+            name = name_of(model, "joint", j)
+            if kind == FREE:
+                place = keyed(self.t, self.q[:, q : q + 3], kind="natural")
+                tracks[name] = FreeTrack(place, keyed_rotation(self.t, self.q[:, q + 3 : q + 7], kind="natural"))
+            elif kind == BALL:
+                tracks[name] = keyed_rotation(self.t, self.q[:, q : q + 4], kind="natural")
+            else:
+                tracks[name] = keyed(self.t, self.q[:, q], kind="natural")
+        return Clip(model, tracks, self.q[0])
+
+
+def follow(
+    model: mujoco.MjModel,
+    goals: Goals,
+    times: ArrayLike,
+    *,
+    q0: ArrayLike | None = None,
+    joints: Sequence[str] | None = None,
+    velocity: ArrayLike | None = None,
+    acceleration: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    iterations: int = 15,
+) -> Motion:
+    """Motion of `model` along goals(t) at evenly spaced `times` (k,), smooth over the whole clip.
+
+    `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
+    by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
+    Raises ModelError for times that are not evenly spaced.
+    """
+    t = np.asarray(times, dtype=float)
+    if t.ndim != 1 or len(t) < 3 or not np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6) or t[1] <= t[0]:
+        raise ModelError("a track needs at least three evenly spaced, increasing times")
+    line = _Line(model, goals, t, joints)
+    v_max, a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
+    q = _first_guess(line, q0, start, v_max, a_max)
+    limits = Limits(line.space, float(t[1] - t[0]), v_max, a_max, start is not None)
+    q = _smoothed(line, q, limits, iterations)
+    return _motion(line, q, limits)
+
+
+class _Line:
+    """Problems of all instants, over one model."""
+
+    def __init__(self, model: mujoco.MjModel, goals: Goals, t: Array, joints: Sequence[str] | None):
+        self.model, self.t, self.space = model, t, Space(model)
+        kinematics = Kinematics(model)
+        self.problems = [Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t]
+        self.moved = np.any([p.moved for p in self.problems], axis=0)
+
+    def rows(self, q: Array) -> list[tuple[Array, Array]]:
+        """Weighted residuals and Jacobians of every instant; judged rows count most."""
+        out = []
+        for problem, x in zip(self.problems, q, strict=True):
+            w = problem.weighted(problem.raw(x[None]))
+            weight = np.where(problem.judged, 1.0, 1e-2) / _TRACKING
+            out.append((w.r[0] * weight, w.J[0] * weight[:, None]))
+        return out
+
+
+def _first_guess(line: _Line, q0: ArrayLike | None, start: ArrayLike | None, v_max: Array, a_max: Array) -> Array:
+    """The start that differential inverse kinematics follows best, and its motion (k, nq)."""
+    model = line.model
+    first = line.problems[0]
+    if start is not None:
+        starts = line.space.check(start)[None]
+    else:
+        found = solve(model, first.goals, q0=q0, all=True, restarts=40)
+        starts = found.solutions[:_STARTS] if found.solved else found.q[None]
+    best: tuple[float, Array] | None = None
+    for q in starts:
+        path, cost = _streamed(line, q, v_max)
+        if best is None or cost < best[0]:
+            best = cost, path
+    assert best is not None
+    return best[1]
+
+
+def _streamed(line: _Line, q: Array, v_max: Array) -> tuple[Array, float]:
+    """Motion (k, nq) by one tick after the other, and its sum of squared deviations and accelerations."""
+    dt = float(line.t[1] - line.t[0])
+    follower = Follower(line.model, dt=dt, q0=q, velocity=v_max)
+    out, cost = [q], 0.0
+    for problem in line.problems[1:]:
+        tick = follower.step(problem.goals)
+        w = problem.weighted(problem.raw(tick.q[None]))
+        cost += float(np.sum(w.r**2)) / _TRACKING**2
+        out.append(tick.q)
+    path = np.array(out)
+    v = line.space.difference(path[1:], path[:-1]) / dt
+    return path, cost + float(np.sum(np.diff(v, axis=0) ** 2)) / (dt * _REFERENCE) ** 2
+
+
+def _smoothed(line: _Line, q: Array, limits: Limits, iterations: int) -> Array:
+    """Sequential quadratic programming from q (k, nq): each step is cut until the cost falls."""
+    reach = 0.5
+    rows = line.rows(q)
+    cost = limits.cost(q, rows)
+    for _ in range(iterations):
+        step = smoothest_step(line.space, q, rows, limits, line.moved, reach)
+        trial = line.space.step(q, step)
+        rows_trial = line.rows(trial)
+        lower = limits.cost(trial, rows_trial)
+        if lower >= cost and limits.broken(q) <= limits.broken(trial) + 1e-9:
+            reach *= 0.25
+            if reach < 1e-6:
+                break
+            continue
+        gain, moved = cost - lower, float(np.abs(step).max())
+        q, rows, cost, reach = trial, rows_trial, lower, min(2 * reach, 1.0)
+        if moved < 1e-7 or (0 <= gain < 1e-9 * cost):
+            break
+    return q
+
+
+def _motion(line: _Line, q: Array, limits: Limits) -> Motion:
+    space, dt = line.space, limits.dt
+    steps = space.difference(q[1:], q[:-1]) / dt
+    v = np.concatenate([steps[:1], 0.5 * (steps[1:] + steps[:-1]), steps[-1:]])
+    inner = np.diff(steps, axis=0) / dt
+    a = np.concatenate([inner[:1], inner, inner[-1:]])
+    reports = [residuals(p, x) for p, x in zip(line.problems, q, strict=True)]
+    judged = [_judged(p, report) for p, report in zip(line.problems, reports, strict=True)]
+    position = np.array([max((r.position for r in rs), default=0.0) for rs in judged])
+    rotation = np.array([max((r.rotation for r in rs), default=0.0) for rs in judged])
+    off = np.array([not all(r.met for r in rs) for rs in judged])
+    missed = _stretches(line, q, off, position, rotation)
+    arrays = [frozen(x) for x in (line.t, q, v, a, position, rotation)]
+    return Motion(line.model, *arrays, missed, limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max))
+
+
+def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:
+    return [r for r, group in zip(report, problem.groups, strict=True) if problem.judged[group.rows].any()]
+
+
+def _stretches(
+    line: _Line, q: Array, off: NDArray[np.bool_], position: Array, rotation: Array
+) -> tuple[Missed, ...]:
+    out = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(int)))
+    for i, j in edges.reshape(-1, 2):
+        k = int(i + np.argmax(position[i:j] + rotation[i:j]))
+        once = solve(line.model, line.problems[k].goals, q0=q[k], restarts=60)
+        verdict = None if once.solved else once.verdict
+        out.append(
+            Missed(float(line.t[i]), float(line.t[j - 1]), float(line.t[k]), float(position[k]), float(rotation[k]), verdict)
+        )
+    return tuple(out)
