@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -71,11 +72,22 @@ class Motion:
 
 
 class Runner(Protocol):
-    """One method of one engine; `knob` is "step" [s] or "tolerance"."""
+    """One method of one engine, by steps [s] or by tolerances."""
 
-    engine: str
-    method: str
-    knob: str
+    @property
+    def engine(self) -> str:
+        """The engine's name."""
+        ...
+
+    @property
+    def method(self) -> str:
+        """The method's name."""
+        ...
+
+    @property
+    def knob(self) -> str:
+        """What is turned: "step" or "tolerance"."""
+        ...
 
     def settings(self) -> Iterable[float]:
         """Steps or tolerances from coarse to fine."""
@@ -181,7 +193,7 @@ class MujocoSteps:
 
     def __init__(self, case: Case, integrator: str) -> None:
         self.case, self.method = case, integrator
-        self.model = _copy(case.model)
+        self.model = deepcopy(case.model)
         self.model.opt.integrator = int(INTEGRATORS[integrator])
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.data = mujoco.MjData(self.model)
@@ -208,12 +220,6 @@ class MujocoSteps:
                 if not np.isfinite(data.qvel).all():
                     break
         return Motion(q, v, every * case.frames * (4 if self.method == "rk4" else 1))
-
-
-def _copy(model: mujoco.MjModel) -> mujoco.MjModel:
-    from copy import deepcopy
-
-    return deepcopy(model)
 
 
 def _motion(case: Case, y: Array, evaluations: int) -> Motion:
