@@ -79,15 +79,16 @@ def compile_ir(kernels: str, loops: str, *, inline: bool) -> bytes:
 
 @dataclass(frozen=True)
 class Loaded:
-    """Machine code in memory; lives as long as this object."""
+    """Machine code in memory; lives as long as this object or a function taken from it."""
 
     engine: Any
     seconds: float
 
     def function(self, name: str, *argtypes: Any) -> Any:
         """A function of the module as a ctypes callable that releases the interpreter lock."""
-        address = self.engine.get_function_address(name)
-        return ctypes.CFUNCTYPE(None, *argtypes)(address)
+        function: Any = ctypes.CFUNCTYPE(None, *argtypes)(self.engine.get_function_address(name))
+        function.engine = self.engine  # the code must outlive whoever can call it
+        return function
 
 
 def load(code: bytes) -> Loaded:

@@ -179,7 +179,7 @@ def _rate_jacobian(eq: Equations, kind: str) -> Tape:
     """Of dx/dt by x (plain coordinates, quaternions included), u and p."""
     zero: list[Scalar] = [0.0] * eq.layout.nv
     _, residual = _held_residual(eq, kind, zero)
-    outputs = {"dx": _rate_terms(eq, kind)}
+    outputs = {"rate": _rate_terms(eq, kind)}
     kinematic, activation = eq.coordinate_rate(), eq.actuation[1]
     for name, keys in (("x", ("q", "v", "act")), ("u", ("u",)), ("p", ("p",))):
         seeds = [{node: 1.0} for key in keys for node in eq.inputs[key]]

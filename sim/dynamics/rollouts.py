@@ -102,17 +102,29 @@ def shape_of(smooth: Smooth, law: LinearFeedback | None) -> Shape:
     return Shape(lay.nq, lay.nv, lay.na, lay.nu, lay.nw, size, tuple(lay.quaternions), nr, ng)
 
 
-def loop_code(
+@dataclass(frozen=True)
+class Loop:
+    """A compiled integration: its code and the function to call."""
+
+    code: Code
+    run: Any
+
+
+def compiled_loop(
     smooth: Smooth,
     name: str,
     lanes: int,
     law: LinearFeedback | None,
     method: Tableau,
     emit: Callable[..., str],
-) -> Code:
-    """Machine code of the integration that `emit` writes, around the model's rate and a law."""
+    kinds: list[Any],
+) -> Loop:
+    """The integration that `emit` writes, around the model's rate and a law."""
     pattern = b"" if law is None else law.pattern().tobytes()
-    key = key_of(smooth.key, name, str(lanes), _method_key(method), pattern)
+    known = (name, lanes, method, pattern)
+    found: Loop | None = smooth.loops.get(known)
+    if found is not None:
+        return found
 
     def make() -> tuple[str, str, dict[str, Any]]:
         rate = smooth.tape("rate")
@@ -125,7 +137,10 @@ def loop_code(
         loops += emit(name, method, shape_of(smooth, law), lanes)
         return kernels, loops, facts_of(rate) | {"formulation": smooth.formulation}
 
-    return smooth.code(key, lambda: obtain(f"{name}:{method.name}", lanes, smooth.cache, key, make))
+    key = key_of(smooth.key, name, str(lanes), _method_key(method), pattern)
+    code = obtain(f"{name}:{method.name}", lanes, smooth.cache, key, make)
+    loop = smooth.loops[known] = Loop(code, code.loaded.function(name, *kinds))
+    return loop
 
 
 @dataclass(frozen=True)
@@ -145,12 +160,14 @@ def initial_states(smooth: Smooth, q0: ArrayLike, v0: ArrayLike, act0: ArrayLike
         if array.ndim not in (1, 2) or array.shape[-1] != size:
             raise EngineError(f"{name} has shape {array.shape}; expected ({size},) or (batch, {size})")
         parts.append(array)
+    if all(p.ndim == 1 for p in parts):
+        return Start(np.concatenate(parts)[None], True)
     counts = {len(p) for p in parts if p.ndim == 2}
     if len(counts) > 1:
         raise EngineError(f"q0, v0, act0 are batches of different lengths: {sorted(counts)}")
-    count = counts.pop() if counts else 1
+    count = counts.pop()
     rows = [np.broadcast_to(p, (count, p.shape[-1])) for p in parts]
-    return Start(np.ascontiguousarray(np.concatenate(rows, axis=1)), not any(p.ndim == 2 for p in parts))
+    return Start(np.ascontiguousarray(np.concatenate(rows, axis=1)), False)
 
 
 @dataclass(frozen=True)
@@ -233,8 +250,7 @@ def fixed(
     table = _prescribed_rows(smooth, w, (times[:, None] + step * method.c).ravel(), count)
     parameters = per_state("p", smooth.parameter_values if p is None else p, len(smooth.parameters), count)
     lanes = 1 if count == 1 else smooth.lanes
-    code = loop_code(smooth, "fixed", lanes, law, method, fixed_steps)
-    run = code.loaded.function("fixed", *_FIXED)
+    loop = compiled_loop(smooth, "fixed", lanes, law, method, fixed_steps, _FIXED)
     path = np.empty((count, steps // every + 1, lay.nx))
     applied = np.empty((count, periods if law is not None else 0, lay.nu))
 
@@ -242,7 +258,7 @@ def fixed(
         def at(rows: Rows) -> int:
             return address(rows.array) + 8 * first * rows.per_state
 
-        run(
+        loop.run(
             size, periods, hold, every, step, address(start.x) + 8 * first * lay.nx,
             at(rows), rows.per_state, rows.per_row, at(gains), gains.per_state,
             address(applied) + 8 * first * periods * lay.nu,
@@ -251,7 +267,7 @@ def fixed(
         )  # fmt: skip
 
     evaluations = steps * len(live_stages(method.A, method.b))
-    work = count * evaluations * code.facts["operations"]
+    work = count * evaluations * loop.code.facts["operations"]
     begin = time.perf_counter()
     in_parallel(call, count, lanes, smooth.threads if work > _PARALLEL_OPERATIONS else 1)
     seconds = time.perf_counter() - begin
@@ -280,10 +296,9 @@ def adaptive(
     periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
     law, rows, gains = control_rows(smooth, controls, periods, count)
     parameters = per_state("p", smooth.parameter_values if p is None else p, len(smooth.parameters), count)
-    tolerance = np.ascontiguousarray(np.broadcast_to(np.asarray(atol, dtype=float), (lay.nx,)))
+    tolerance = np.full(lay.nx, atol, dtype=float)
     lanes = 1 if count == 1 else smooth.lanes
-    code = loop_code(smooth, "adaptive", lanes, law, method, adaptive_steps)
-    run = code.loaded.function("adaptive", *_ADAPTIVE)
+    loop = compiled_loop(smooth, "adaptive", lanes, law, method, adaptive_steps, _ADAPTIVE)
     path = np.full((count, len(t_eval), lay.nx), np.nan)
     path[:, 0] = start.x
     last, stats = np.empty_like(start.x), np.zeros((count, len(STATISTICS)))
@@ -294,7 +309,7 @@ def adaptive(
         def at(rows: Rows) -> int:
             return address(rows.array) + 8 * first * rows.per_state
 
-        run(
+        loop.run(
             size, periods, t0, t1, hold or t1 - t0, rtol, address(tolerance), float(max_steps),
             address(start.x) + 8 * first * lay.nx, address(h0) + 8 * first,
             at(rows), rows.per_state, rows.per_row, at(gains), gains.per_state,
@@ -313,8 +328,10 @@ def adaptive(
 
 
 def _shown(rows: Rows, count: int) -> Array:
-    table = np.atleast_2d(rows.array)
-    return np.broadcast_to(table, (count, *table.shape[-2:]))
+    table = rows.array if rows.array.ndim > 1 else rows.array[None]
+    return (
+        table[None] if count == 1 and table.ndim == 2 else np.broadcast_to(table, (count, *table.shape[-2:]))
+    )
 
 
 def finish(
@@ -332,7 +349,8 @@ def finish(
     """The result as it was asked for: a batch or one state."""
     rejected = np.zeros(len(path), np.int64) if rejected is None else rejected
     status = np.zeros(len(path), np.int64) if status is None else status
-    status = np.where((status == 0) & ~np.isfinite(path[:, -1]).all(axis=1), len(STATUS) - 1, status)
+    if not np.isfinite(path[:, -1]).all():
+        status = np.where((status == 0) & ~np.isfinite(path[:, -1]).all(axis=1), len(STATUS) - 1, status)
     if start.single:
         path, u, status, evaluations, rejected = path[0], u[0], status[0], evaluations[0], rejected[0]
     t = t.view()

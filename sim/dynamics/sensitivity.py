@@ -115,4 +115,4 @@ def _rate(
     q, v, act = x[:, : lay.nq], x[:, lay.nq : lay.nq + lay.nv], x[:, lay.nq + lay.nv :]
     out = smooth.evaluate("rate_jacobian", q=q, v=v, act=act, u=u, p=p)
     widths = {"x": lay.nx, "u": lay.nu, "p": len(smooth.parameters)}
-    return out["dx"], {name: out["d" + name].reshape(len(x), lay.nx, n) for name, n in widths.items()}
+    return out["rate"], {name: out["d" + name].reshape(len(x), lay.nx, n) for name, n in widths.items()}

@@ -9,7 +9,7 @@ Nothing is compiled before it is asked for; what was compiled once is found on d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path as FilePath
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..compile import jit
 from ..compile.cache import Cache, default_folder, key_of
-from ..compile.program import Bound, Build, Code, Program, map_source, obtain, workers
+from ..compile.program import Bound, Build, Program, map_source, obtain, workers
 from ..errors import EngineError
 from ..integrate.tableau import Tableau
 from ..integrate.tableaus import DOPRI5, RK4
@@ -30,7 +30,7 @@ from .functions import FUNCTIONS, cheaper_formulation
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
 from .problem import SmoothProblem
-from .rollouts import Controls, Path, Prescribed, PythonLaw, adaptive, fixed, initial_states
+from .rollouts import Controls, Loop, Path, Prescribed, PythonLaw, adaptive, fixed, initial_states
 from .sensitivity import StepDerivatives, step_derivatives
 from .support import differences, unsupported
 from .symbolic import Equations
@@ -173,7 +173,7 @@ class Smooth:
         )
         self.cache = cache
         self._programs: dict[tuple[str, int], Program] = {}
-        self._codes: dict[str, Code] = {}
+        self.loops: dict[tuple[Any, ...], Loop] = {}
 
     @cached_property
     def key(self) -> str:
@@ -212,12 +212,6 @@ class Smooth:
             found = self._programs[name, lanes] = Program(code, lanes)
         return found
 
-    def code(self, key: str, find: Callable[[], Code]) -> Code:
-        """Machine code by key, found once."""
-        if key not in self._codes:
-            self._codes[key] = find()
-        return self._codes[key]
-
     def bind(self, name: str) -> Bound:
         """Function `name` on its own arrays, for the quickest calls on one state."""
         return Bound(self.program(name, 1))
@@ -226,7 +220,7 @@ class Smooth:
     def stats(self) -> Stats:
         """What was built so far."""
         programs = [*self._programs.values()]
-        builds = tuple([p.build for p in programs] + [c.build for c in self._codes.values()])
+        builds = tuple([p.build for p in programs] + [loop.code.build for loop in self.loops.values()])
         facts = [p.code.facts for p in programs if p.build.name == "forward"]
         facts = facts or [self.program("forward", 1).code.facts]
         return Stats(facts[0]["formulation"], facts[0]["operations"], self.lanes, builds)
