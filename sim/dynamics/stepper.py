@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..compile.program import address
 from ..compile.rollout import fixed_steps, live_stages
 from ..integrate.tableau import Tableau
-from .rollouts import _FIXED, loop_code
+from .rollouts import _FIXED, compiled_loop
 
 if TYPE_CHECKING:
     from .smooth import Smooth
@@ -30,8 +30,7 @@ class Stepper:
 
     def __init__(self, smooth: Smooth, method: Tableau, most: int):
         lay = smooth.layout
-        code = loop_code(smooth, "fixed", 1, None, method, fixed_steps)
-        self._run = code.loaded.function("fixed", *_FIXED)
+        self._run = compiled_loop(smooth, "fixed", 1, None, method, fixed_steps, _FIXED).run
         self._x, self._u = np.zeros(lay.nx), np.zeros(lay.nu)
         self._path, self._none = np.empty((most + 1, lay.nx)), np.zeros(max(1, lay.nw))
         self._parameters = np.ascontiguousarray(smooth.parameter_values)
