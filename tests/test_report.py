@@ -109,6 +109,12 @@ def test_recommendation_takes_the_cheapest_that_is_good_enough():
     assert "nothing reaches it" in lines[2]
 
 
+def test_luck_below_the_reference_is_not_recommended():
+    result = Report("x", (row("smooth", 1e-12, 1.0),), (Yardstick("reference", 1e-8),))
+    assert result.cheapest(1e-6) is result.rows[0]
+    assert result.cheapest(1e-9) is None and "not that sure" in result.recommendation()
+
+
 def test_stiffness_is_said():
     rows = tuple(
         row("smooth", 1e-5, 1.0, knob="tolerance", setting=t, n=n) for t, n in ((1e-3, 900), (1e-6, 950))
