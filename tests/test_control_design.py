@@ -12,6 +12,7 @@ from pantograph.controllers.design import (
     closed_loop,
     controllability,
     dlqr,
+    figures,
     finite_horizon,
     held,
     linearise,
@@ -340,3 +341,17 @@ def test_loop_gain_and_root_locus_by_definition():
     np.testing.assert_allclose(
         np.sort_complex(linalg.eigvals(closed_loop(s, [K]).A)), np.sort_complex(locus[20]), atol=1e-8
     )
+
+
+def test_pictures_show_what_was_computed():
+    A, B, _, _, K = control_gains.inverted_pendulum()
+    s = system(A, B)
+    chart = figures.bode(s, [K])
+    w, gain = chart.axes[0].lines[0].get_data()
+    np.testing.assert_allclose(10 ** (gain / 20), np.abs(loop_response(s, [K], w)))
+    assert f"{np.degrees(margins(s, [K]).phase):.1f} deg" in chart.get_suptitle()
+    chart = figures.locus(s, [K])
+    dots = chart.axes[0].lines[3].get_data()
+    np.testing.assert_allclose(np.sort(dots[0]), np.sort(linalg.eigvals(closed_loop(s, [K]).A).real))
+    chart = figures.step(s, [K], 0)
+    assert chart.axes[0].lines[0].get_ydata()[-1] == pytest.approx(1 / (K[0] - control_gains.G), rel=1e-2)

@@ -1,0 +1,111 @@
+"""Commands of the controllers: `pantograph control` compares laws, `pantograph fit` makes motion possible."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ..sim.errors import PantographError
+
+console = Console()
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked joints.")]
+
+
+def control(
+    scene: SceneFile,
+    compare: Annotated[str, typer.Option(help="Laws, separated by commas: pid,computed-torque,lqr.")] = "",
+    sweep: Annotated[list[str] | None, typer.Option(help="Values of a parameter: frequency=2,5,10.")] = None,
+    trials: Annotated[int, typer.Option(help="Disturbed runs a law.", min=0)] = 8,
+    mass: Annotated[float, typer.Option(help="Masses differ by up to this part.", min=0.0)] = 0.1,
+    push: Annotated[
+        float, typer.Option(help="Pushes of up to this part of the drives' force.", min=0.0)
+    ] = 0.2,
+    seed: Annotated[int, typer.Option(help="Of the disturbances.")] = 0,
+    processes: Annotated[int | None, typer.Option(help="Processes; default: all processors.", min=1)] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the table and the picture.")] = Path("out"),
+) -> None:
+    """Run a scene under several control laws, as modelled and disturbed, and compare them."""
+    from ..sim.compose import LAWS
+    from ..sim.scene.load import load_scene
+    from . import experiments
+
+    loaded = load_scene(scene)
+    own = loaded.controller.law if loaded.controller else "pd"
+    laws = [law.strip() for law in compare.split(",") if law.strip()] or [own]
+    if unknown := [law for law in laws if law not in LAWS]:
+        raise PantographError(f"no law {unknown[0]!r}; there is: {', '.join(sorted(LAWS))}")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"controlling {scene.stem}", total=None)
+        result = experiments.compare(
+            loaded,
+            laws,
+            sweep=dict(_values(text) for text in sweep or []),
+            trials=trials,
+            mass=mass,
+            push=push,
+            seed=seed,
+            processes=processes,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    console.print(*_tables(result), sep="\n")
+    console.print(f"table: {experiments.write_csv(result, out / f'{scene.stem}.control.csv')}")
+    picture = out / f"{scene.stem}.control.png"
+    experiments.figure(result).savefig(picture, dpi=120)
+    console.print(f"picture: {picture}")
+
+
+def _values(text: str) -> tuple[str, list[Any]]:
+    """A parameter and its values from ``word=a,b,c``; numbers where they are numbers."""
+    word, sign, rest = text.partition("=")
+    if not (word and sign and rest):
+        raise PantographError(f"a sweep is WORD=value,value, as frequency=2,5,10, not {text!r}")
+    return word.strip(), [_value(part.strip()) for part in rest.split(",")]
+
+
+def _value(text: str) -> Any:
+    if text in ("true", "false"):
+        return text == "true"
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _tables(result: Any) -> tuple[Table, Table]:
+    """How well each law follows, and what it takes."""
+    count = len(result.disturbances)
+    well = _columns("law", "RMS", "max", f"worst RMS of {count}", "failed", "settling", "overshoot")
+    well.title = "errors over the tracked joints [rad, m], settling [s]"
+    cost = _columns("law", "effort", "work J", "saturated", "tick us", "99 % us", "of period")
+    cost.title = f"what it takes; period {result.period * 1e3:g} ms"
+    for row in result.rows:
+        f, name = row.nominal, row.variant.name
+        settled = "never" if math.isnan(f.settling) else f"{f.settling:.3f}"
+        robust = f"{row.robust:.2e}" if count else "-"
+        well.add_row(
+            name, f"{f.rms:.2e}", f"{f.worst:.2e}", robust, str(row.failed), settled, f"{f.overshoot:.1%}"
+        )
+        cost.add_row(
+            name,
+            f"{f.effort:.4g}",
+            f"{f.work:.4g}",
+            f"{f.saturated:.1%}",
+            f"{f.tick * 1e6:.0f}",
+            f"{f.tick99 * 1e6:.0f}",
+            f"{f.tick99 / result.period:.1%}",
+        )
+    return well, cost
+
+
+def _columns(*heads: str) -> Table:
+    table = Table()
+    for head in heads:
+        table.add_column(head, justify="left" if head == "law" else "right")
+    return table

@@ -1,0 +1,252 @@
+"""Experiments: the same scene under several laws, as modelled and disturbed, in one table and one picture."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models import names_of
+from ..sim.compile.program import workers
+from ..sim.compose import check_law
+from ..sim.engines.interface import Role
+from ..sim.errors import PantographError
+from ..sim.plan import Plan, make_plan
+from ..sim.scene.schema import Scene
+from .gains import force_limits
+from .nominal import Nominal
+from .reality import LOOP_WORDS
+from .trial import Disturbance, Figures, Trial, run_trial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A law with its parameters, and what it is called in tables."""
+
+    law: str
+    words: Mapping[str, Any]
+    name: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """One variant: figures of the undisturbed run, ``nominal``, and of the ``disturbed`` ones in order."""
+
+    variant: Variant
+    nominal: Figures
+    disturbed: tuple[Figures, ...]
+
+    @property
+    def failed(self) -> int:
+        """Disturbed runs that diverged."""
+        return sum(f.status != "done" for f in self.disturbed)
+
+    @property
+    def robust(self) -> float:
+        """Largest RMS error [rad, m] of all runs; infinite when one diverged."""
+        return max(f.rms for f in (self.nominal, *self.disturbed))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Rows in the order asked for, disturbances, and the samples of undisturbed runs by variant."""
+
+    rows: tuple[Row, ...]
+    disturbances: tuple[Disturbance, ...]
+    period: float
+    trials: Mapping[str, Trial]
+
+
+def compare(
+    scene: Scene,
+    laws: Sequence[str],
+    *,
+    sweep: Mapping[str, Sequence[Any]] | None = None,
+    trials: int = 0,
+    mass: float = 0.1,
+    push: float = 0.2,
+    seed: int = 0,
+    processes: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Run ``scene`` under each of ``laws``: once as modelled, ``trials`` times disturbed (the same for all).
+
+    A disturbed machine has its masses changed by up to the part ``mass``, each body's on its own, and joint
+    forces of up to ``push`` of what its drives can give (or of its weight, of ideal drives) for a tenth of
+    the scene. ``sweep`` gives lists of parameter values: every combination is a variant. The scene's own
+    controller parameters go to its own law, those of sensors and drives to all. Undisturbed runs are timed
+    one after the other, disturbed ones share the processors.
+    Raises SceneError for laws and parameters that do not fit.
+    """
+    plan = _plan(scene)
+    variants = _variants(scene, laws, sweep or {})
+    disturbances = tuple(_disturbances(plan, trials, mass, push, seed))
+    total = len(variants) * (1 + len(disturbances))
+    done = 0
+
+    def tell() -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
+
+    nominal: dict[str, Trial] = {}
+    for variant in variants:
+        nominal[variant.name] = run_trial(plan, variant.law, variant.words, Disturbance())
+        tell()
+    jobs = list(product(range(len(variants)), range(len(disturbances))))
+    found: dict[tuple[int, int], Figures] = {}
+    for job, figures in _spread(scene, variants, disturbances, jobs, processes or workers()):
+        found[job] = figures
+        tell()
+    rows = tuple(
+        Row(v, nominal[v.name].figures, tuple(found[i, j] for j in range(len(disturbances))))
+        for i, v in enumerate(variants)
+    )
+    assert plan.period is not None
+    return Comparison(rows, disturbances, plan.period, nominal)
+
+
+def write_csv(comparison: Comparison, path: str | Path) -> Path:
+    """Every run as a row: law, parameters, disturbance, figures. Raises PantographError if it cannot."""
+    path = Path(path)
+    runs = list(_runs(comparison))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as f:
+            writer = csv.DictWriter(f, fieldnames=list(runs[0]))
+            writer.writeheader()
+            writer.writerows(runs)
+    except OSError as e:
+        raise PantographError(f"cannot write {path}: {e.strerror}") from None
+    return path
+
+
+def _runs(comparison: Comparison) -> list[dict[str, Any]]:
+    out = []
+    for row in comparison.rows:
+        cases = zip(
+            ("as modelled", *(d.say for d in comparison.disturbances)),
+            (row.nominal, *row.disturbed),
+            strict=True,
+        )
+        for say, figures in cases:
+            words = " ".join(f"{k}={v}" for k, v in row.variant.words.items())
+            out.append({"law": row.variant.law, "parameters": words, "disturbance": say} | asdict(figures))
+    return out
+
+
+def figure(comparison: Comparison) -> Figure:
+    """Errors over time and forces of the undisturbed runs, and the RMS error of all runs, a law a colour."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    chart = Figure(figsize=(10, 9), layout="constrained")
+    top, middle, bottom = chart.subplots(3, 1)
+    for i, row in enumerate(comparison.rows):
+        trial, colour = comparison.trials[row.variant.name], colormaps["tab10"](i % 10)
+        size = np.sqrt(np.sum(trial.error**2, axis=1))
+        top.semilogy(trial.t, np.maximum(size, 1e-12), color=colour, label=row.variant.name)
+        middle.plot(trial.t, np.sqrt(np.sum(trial.tau**2, axis=1)), color=colour)
+        dots = [f.rms for f in row.disturbed]
+        bottom.plot([i] * len(dots), dots, "o", color=colour, alpha=0.4, ms=5)
+        bottom.plot([i], [row.nominal.rms], "_", color=colour, ms=24, mew=3)
+    top.set_ylabel("error of all joints [rad, m]")
+    middle.set_ylabel("forces of all joints [N m, N]")
+    bottom.set_ylabel("RMS error [rad, m]")
+    middle.set_xlabel("time [s]")
+    bottom.set_yscale("log")
+    bottom.set_xticks(range(len(comparison.rows)), [row.variant.name for row in comparison.rows])
+    bottom.set_title("as modelled (bars) and disturbed (dots)", fontsize=10)
+    top.legend(fontsize=8, ncols=3)
+    for ax in (top, middle, bottom):
+        ax.grid(alpha=0.3)
+    return chart
+
+
+def _plan(scene: Scene) -> Plan:
+    plan = make_plan(scene)
+    if plan.period is None:
+        raise PantographError(
+            "this scene has nothing to control: give joints the role 'tracked', as in [roles] tracked = [...]"
+        )
+    return plan
+
+
+def _variants(scene: Scene, laws: Sequence[str], sweep: Mapping[str, Sequence[Any]]) -> list[Variant]:
+    own = scene.controller.parameters if scene.controller else {}
+    shared = {word: value for word, value in own.items() if word in LOOP_WORDS}
+    out = []
+    for law in laws:
+        base = own if scene.controller and law == scene.controller.law else shared
+        for values in product(*sweep.values()):
+            chosen = dict(zip(sweep, values, strict=True))
+            label = " ".join([law, *(f"{k}={v}" for k, v in chosen.items())])
+            check_law(law, dict(base) | chosen)
+            out.append(Variant(law, dict(base) | chosen, label))
+    return out
+
+
+def _disturbances(plan: Plan, trials: int, mass: float, push: float, seed: int) -> list[Disturbance]:
+    m, rng, out = plan.problem.model, np.random.default_rng(seed), []
+    tracked = plan.problem.dofs(Role.TRACKED)
+    low, high = force_limits(m)
+    able = np.minimum(-low, high)
+    q0 = plan.problem.state0.q
+    able = np.where(np.isfinite(able), able, np.abs(Nominal(m).weight(q0)).max(initial=1.0))
+    duration = plan.problem.duration
+    for k in range(trials):
+        factors = 1.0 + mass * rng.uniform(-1.0, 1.0, m.nbody)
+        forces = np.where(tracked, push * able * rng.uniform(-1.0, 1.0, m.nv), 0.0)
+        start = float(rng.uniform(0.1, 0.7) * duration)
+        body = int(np.argmax(np.abs(factors - 1.0)))
+        heavy = f"{names_of(m, 'body')[body]} x {factors[body]:.3f}"
+        say = f"#{k} of seed {seed}: {heavy}, push at {start:.2f} s"
+        out.append(Disturbance(tuple(factors), tuple(forces), start, start + 0.1 * duration, say))
+    return out
+
+
+def _spread(
+    scene: Scene,
+    variants: list[Variant],
+    disturbances: tuple[Disturbance, ...],
+    jobs: list[tuple[int, int]],
+    processes: int,
+) -> Any:
+    """Pairs (job, figures) as they are done, on as many processes as wanted."""
+    if processes == 1 or len(jobs) < 2:
+        plan = _plan(scene)
+        for i, j in jobs:
+            yield (i, j), run_trial(plan, variants[i].law, variants[i].words, disturbances[j]).figures
+        return
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=get_context("spawn")) as pool:
+        pending = {
+            pool.submit(_remote, scene, scene._base, variants[i], disturbances[j]): (i, j) for i, j in jobs
+        }
+        for done in as_completed(pending):
+            yield pending[done], done.result()
+
+
+_PLANS: dict[str, Plan] = {}
+
+
+def _remote(scene: Scene, base: Path | None, variant: Variant, disturbance: Disturbance) -> Figures:
+    """One disturbed run in a process of its own, which keeps the plan for the next one."""
+    key = scene.model_dump_json()
+    if key not in _PLANS:
+        scene._base = base
+        _PLANS[key] = _plan(scene)
+    return run_trial(_PLANS[key], variant.law, variant.words, disturbance).figures

@@ -1,0 +1,171 @@
+"""One run of a scene under one law, measured: errors, effort, saturation, settling, time of the computer."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sim.compose import make_engine, make_law
+from ..sim.control import Law, Sampled, Target
+from ..sim.engines.interface import Controls, Held, Problem, Role
+from ..sim.plan import Plan
+from .gains import force_limits
+from .nominal import difference
+
+Array = NDArray[np.float64]
+_BAND = 0.02  # of its motion: a joint that stays this near to its last key has settled
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What a trial does to a machine that the law does not know.
+
+    ``mass``: factor a body (nbody,) on mass and inertia; ``push``: joint forces (nv,) [N m, N] from ``start``
+    to ``stop`` [s]; ``say``: in words.
+    """
+
+    mass: tuple[float, ...] = ()
+    push: tuple[float, ...] = ()
+    start: float = 0.0
+    stop: float = 0.0
+    say: str = "as modelled"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What one trial measured, over the tracked joints.
+
+    ``rms``, ``worst``: errors [rad, m]; ``effort``: RMS of all joint forces together [N m, N]; ``work``: sum
+    of |force x speed| [J]; ``saturated``: part of the samples where a drive gave all it could; ``settling``
+    [s] after the keys rest until every joint stays within 2 % of its motion (NaN: it does not); ``overshoot``
+    beyond the last key, of the motion; ``tick``, ``tick99`` [s]: median and 99th percentile of the law's
+    time a sample; ``status``: of the run.
+    """
+
+    rms: float
+    worst: float
+    effort: float
+    work: float
+    saturated: float
+    settling: float
+    overshoot: float
+    tick: float
+    tick99: float
+    status: str
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Figures of a run, with its samples: t (n,) [s], error (n, nv), tau (n, nv)."""
+
+    figures: Figures
+    t: Array
+    error: Array
+    tau: Array
+
+
+class _Watched:
+    """A law that keeps what it saw and gave, and how long it took; the measuring end of a trial."""
+
+    def __init__(self, law: Law) -> None:
+        self.law = law
+        self.seen: list[tuple[float, Array, Array, Target, Array, float]] = []
+
+    def start(self) -> Any:
+        return self.law.start()
+
+    def __call__(self, t: float, q: Array, v: Array, target: Target, memory: Any) -> tuple[Array, Any]:
+        begun = time.perf_counter()
+        tau, memory = self.law(t, q, v, target, memory)
+        self.seen.append((t, q, v, target, tau, time.perf_counter() - begun))
+        return tau, memory
+
+
+class _Pushed:
+    """Controls with joint forces added that nobody ordered."""
+
+    def __init__(self, controls: Controls, disturbance: Disturbance) -> None:
+        self.controls, self.period, self.by = controls, controls.period, disturbance
+
+    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
+        held = self.controls.sample(k, t, q, v)
+        on = self.by.push and self.by.start <= t < self.by.stop
+        return Held(held.ctrl, held.qfrc + np.array(self.by.push)) if on else held
+
+
+def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Disturbance) -> Trial:
+    """Run a plan under the law ``law`` with parameters ``words``; the law believes the undisturbed model.
+
+    Raises SceneError for a law or parameter that does not fit, and PantographError when the scene has nothing
+    to control.
+    """
+    problem, period = plan.problem, plan.period
+    assert period is not None
+    watched = _Watched(make_law(law, problem, dict(words), period))
+    true = _disturbed(problem, disturbance)
+    controls = _Pushed(Sampled(watched, true, period), disturbance)
+    segment = make_engine(plan.engine.what).run(true, (0.0, true.steps * true.step), controls)
+    return _measured(problem, watched, segment.status)
+
+
+def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
+    if not disturbance.mass:
+        return problem
+    model = copy.copy(problem.model)
+    factors = np.array(disturbance.mass)
+    model.body_mass[:] *= factors
+    model.body_inertia[:] *= factors[:, None]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(problem, model=model)
+
+
+def _measured(problem: Problem, watched: _Watched, status: str) -> Trial:
+    m, tracked = problem.model, problem.dofs(Role.TRACKED)
+    t = np.array([row[0] for row in watched.seen])
+    error = np.array([difference(m, row[1], row[3].q) for row in watched.seen])[:, tracked]
+    v, tau = (np.array([row[i] for row in watched.seen])[:, tracked] for i in (2, 4))
+    low, high = (limit[tracked] for limit in force_limits(m))
+    given = np.clip(tau, low, high)
+    seconds = np.array([row[5] for row in watched.seen])
+    at_limit = (tau <= low) | (tau >= high)
+    settling, overshoot = _arrival(t, error, [row[3] for row in watched.seen], tracked, m)
+    finite = bool(np.isfinite(error).all()) and status == "done"
+    figures = Figures(
+        rms=float(np.sqrt(np.mean(error**2))) if finite else np.inf,
+        worst=float(np.abs(error).max()) if finite else np.inf,
+        effort=float(np.sqrt(np.mean(np.sum(given**2, axis=1)))),
+        work=float(np.sum(np.abs(given * v)) * (t[1] - t[0])) if len(t) > 1 else 0.0,
+        saturated=float(at_limit.any(axis=1).mean()),
+        settling=settling,
+        overshoot=overshoot,
+        tick=float(np.median(seconds)),
+        tick99=float(np.percentile(seconds, 99)),
+        status=status,
+    )
+    return Trial(figures, t, error, tau)
+
+
+def _arrival(
+    t: Array, error: Array, targets: list[Target], tracked: NDArray[np.bool_], m: mujoco.MjModel
+) -> tuple[float, float]:
+    """Settling time [s] after the keys rest and overshoot beyond the last key, the worst joint's."""
+    last = targets[-1].q
+    way = np.array([difference(m, target.q, last) for target in targets])[:, tracked]
+    moving = np.flatnonzero([target.v[tracked].any() for target in targets])
+    rest = min(int(moving[-1]) + 1, len(t) - 1) if len(moving) else 0
+    scale = np.maximum(np.abs(way + error).max(axis=0), 1e-12)
+    start = np.where(np.abs(way[0]) > 1e-9, way[0], error[0])
+    left = error[rest:]
+    outside = np.flatnonzero((np.abs(left) > _BAND * scale).any(axis=1))
+    settling = 0.0 if not len(outside) else np.nan
+    if len(outside) and outside[-1] + 1 < len(left):
+        settling = float(t[rest + outside[-1] + 1] - t[rest])
+    beyond = -left * np.sign(start)
+    return settling, float(np.max(beyond / scale, initial=0.0))
