@@ -13,6 +13,7 @@ from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
 from .engines.smooth import adaptive_methods
 from .engines.smooth import methods as smooth_methods
+from .engines.touch import can_touch
 from .errors import SceneError, unknown
 from .scene.build import Setup, build, resolve
 from .scene.mistakes import Mistake, SceneMistakes, report
@@ -312,33 +313,6 @@ def fastest_rate(setup: Setup) -> float:
     moving = setup.roles[m.dof_jntid] != Role.KEYED
     rates = np.maximum(np.sqrt(stiffness * mobility), damping * mobility)
     return float(np.max(rates[moving], initial=0.0))
-
-
-def can_touch(model: mujoco.MjModel) -> bool:
-    """Whether any two geoms of the model could make a contact."""
-    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT):
-        return False
-    if model.npair:
-        return True
-    excluded = {int(s) for s in model.exclude_signature}
-    active = np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
-    weld, parent = model.body_weldid, model.body_parentid
-    for i, g1 in enumerate(active):
-        for g2 in active[i + 1 :]:
-            if not (
-                model.geom_contype[g1] & model.geom_conaffinity[g2]
-                or model.geom_contype[g2] & model.geom_conaffinity[g1]
-            ):
-                continue
-            b1, b2 = sorted((int(model.geom_bodyid[g1]), int(model.geom_bodyid[g2])))
-            w1, w2 = int(weld[b1]), int(weld[b2])
-            if w1 == w2 or (b1 << 16) + b2 in excluded:
-                continue
-            # MuJoCo lets parent and child pass through each other, except for the world
-            if w1 and w2 and (weld[parent[w1]] == w2 or weld[parent[w2]] == w1):
-                continue
-            return True
-    return False
 
 
 def _left_out(setup: Setup, engine: str) -> list[str]:

@@ -17,10 +17,11 @@ from .control import Sampled
 from .engines.contact import INTEGRATORS, ContactEngine
 from .engines.interface import Engine, Role
 from .engines.smooth import SmoothEngine
+from .engines.touch import can_touch
 from .errors import EngineError
 from .integrate import TABLEAUS
 from .integrate.problems import constraints_of
-from .plan import Plan, can_touch
+from .plan import Plan
 from .work_precision import Case, Motion, Reference, trajectory_error
 
 FRAMES = 50

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.sim import Scene, SceneError, make_plan, run
 from pantograph.sim.engines.interface import Drive, Role
-from pantograph.sim.plan import can_touch, fastest_rate
+from pantograph.sim.engines.touch import can_touch
+from pantograph.sim.plan import fastest_rate
 
 PENDULUM = {"models": [{"file": "pendulum"}]}
 KEYED = {"keys": [{"joint": "hinge", "times": [0, 1], "values": [0, 1]}]}

@@ -121,7 +121,7 @@ class MujocoProblem:
 
 def constraints_of(model: mujoco.MjModel) -> list[str]:
     """What in the model MuJoCo treats as a constraint, in words; empty when its dynamics is smooth."""
-    from ..plan import can_touch  # plan knows the integrators too
+    from ..engines.touch import can_touch
 
     off = model.opt.disableflags
     flag = mujoco.mjtDisableBit
