@@ -2,8 +2,9 @@
 
 A keyed degree of freedom gets a large armature A and the force A a_key + drive. It then accelerates with
 a_key up to (forces on it - drive) / A, and the rest of the mechanism, contacts included, feels a body that
-nothing can push. ``drive`` is what inverse dynamics asked for at the evaluation before, so that the remainder
-is a change of forces over one evaluation, divided by A: M a + bias = passive + actuation + constraint + drive.
+nothing can push. ``drive`` is what inverse dynamics asked for at the evaluation before, so that the
+remainder is a change of forces over one evaluation, divided by A:
+M a + bias = passive + actuation + constraint + drive.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 
 from .interface import Array
 
-# Armature relative to the joint's own inertia: large enough that forces move a keyed joint by 1e-7 of what they
-# would otherwise, small enough that MuJoCo's constraint solver keeps its digits (gradient noise about
+# Armature relative to the joint's own inertia: large enough that forces move a keyed joint by 1e-7 of what
+# they would otherwise, small enough that MuJoCo's constraint solver keeps its digits (gradient noise about
 # A * 1e-16 of the inertia).
 STIFFNESS = 1e7
 

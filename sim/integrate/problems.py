@@ -8,6 +8,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from ..engines.touch import can_touch
 from ..errors import EngineError
 from .tableau import Array
 
@@ -121,8 +122,6 @@ class MujocoProblem:
 
 def constraints_of(model: mujoco.MjModel) -> list[str]:
     """What in the model MuJoCo treats as a constraint, in words; empty when its dynamics is smooth."""
-    from ..engines.touch import can_touch
-
     off = model.opt.disableflags
     flag = mujoco.mjtDisableBit
 
