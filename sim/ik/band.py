@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,12 @@ class Limits:
 
 
 def smoothest_step(
-    space: Space, q: Array, rows: list[tuple[Array, Array]], limits: Limits, moved: NDArray[np.bool_], reach: float
+    space: Space,
+    q: Array,
+    rows: list[tuple[Array, Array]],
+    limits: Limits,
+    moved: NDArray[np.bool_],
+    reach: float,
 ) -> Array:
     """Step (k, nv) to the least of the quadratic model of a motion's cost within its limits."""
     columns = np.flatnonzero(moved)
@@ -73,9 +79,9 @@ def smoothest_step(
     v_room = limits.v_max[columns] * dt * (1 - _MARGIN)
     a_room = limits.a_max[columns] * dt * dt * (1 - _MARGIN)
     sets = [
-        ((1.0,), low, high),
-        ((-1.0, 1.0), -v_room - first, v_room - first),
-        ((1.0, -2.0, 1.0), -a_room - second, a_room - second),
+        ((1.0,), low, high, np.full(n, reach)),
+        ((-1.0, 1.0), -v_room - first, v_room - first, np.where(np.isfinite(v_room), v_room, 1.0)),
+        ((1.0, -2.0, 1.0), -a_room - second, a_room - second, np.where(np.isfinite(a_room), a_room, 1.0)),
     ]
     step = np.zeros((k, space.nv))
     step[:, columns] = _interior(H, g, sets)
@@ -141,56 +147,96 @@ def _transposed(stencil: tuple[float, ...], y: Array, k: int) -> Array:
     return out
 
 
-def _interior(H: _Banded, g: Array, sets: list[tuple[tuple[float, ...], Array, Array]], *, steps: int = 40) -> Array:
-    """Least 1/2 x'Hx + g'x with low <= S x <= high for every stencil S; infinite bounds bind nothing."""
-    k, n = H.k, H.n
-    walls = []  # one-sided: sign * S x <= bound
-    for stencil, low, high in sets:
+class _Wall(NamedTuple):
+    """One-sided constraints S x / width <= bound where `on`, over all instants."""
+
+    stencil: tuple[float, ...]
+    bound: Array
+    on: NDArray[np.bool_]
+    width: Array
+
+    def of(self, x: Array) -> Array:
+        return _difference(self.stencil, x) / self.width
+
+    def back(self, y: Array, k: int) -> Array:
+        return _transposed(self.stencil, y / self.width, k)
+
+
+def _walls(k: int, n: int, sets: list[tuple[tuple[float, ...], Array, Array, Array]]) -> list[_Wall]:
+    out = []
+    for stencil, low, high, width in sets:
         for sign, bound in ((1.0, high), (-1.0, -low)):
-            bound = np.broadcast_to(bound, (k - len(stencil) + 1, n))
-            if np.isfinite(bound).any():
-                walls.append((tuple(sign * a for a in stencil), bound, np.isfinite(bound)))
+            b = np.broadcast_to(bound / width, (k - len(stencil) + 1, n))
+            on = np.isfinite(b)
+            if on.any():
+                out.append(_Wall(tuple(sign * a for a in stencil), np.where(on, b, 0.0), on, width))
+    return out
+
+
+def _interior(
+    H: _Banded, g: Array, sets: list[tuple[tuple[float, ...], Array, Array, Array]], *, steps: int = 60
+) -> Array:
+    """Least 1/2 x'Hx + g'x with low <= S x <= high for every stencil S; infinite bounds bind nothing.
+
+    `sets` are (stencil, low, high, width); rows are divided by their width, so that slacks are of order one.
+    """
+    k, n = H.k, H.n
+    walls = _walls(k, n, sets)
     x = np.zeros((k, n))
-    s = [np.where(on, np.maximum(np.where(on, b, 1.0), 1e-3), 1.0) for _, b, on in walls]
-    z = [np.where(on, 1.0, 0.0) for _, _, on in walls]
-    count = max(1, sum(int(on.sum()) for _, _, on in walls))
-    base = H.bands
-    size = max(1.0, float(np.abs(g).max()))
+    s = [np.where(w.on, np.maximum(w.bound, 0.1), 1.0) for w in walls]
+    z = [np.where(w.on, max(1e-6, 0.1 * float(np.abs(g).mean() * w.width.mean())), 0.0) for w in walls]
+    count = max(1, sum(int(w.on.sum()) for w in walls))
+    first = sum(float(np.sum(si * zi)) for si, zi in zip(s, z, strict=True)) / count
     for _ in range(steps):
-        stationary = g + _times(base, x, n)
-        for (S, _, _), zi in zip(walls, z, strict=True):
-            stationary = stationary + _transposed(S, zi, k)
-        gaps = [np.where(on, _difference(S, x) + si - b, 0.0) for (S, b, on), si in zip(walls, s, strict=True)]
+        stationary = g + _times(H.bands, x, n)
+        for w, zi in zip(walls, z, strict=True):
+            stationary = stationary + w.back(zi, k)
+        gaps = [np.where(w.on, w.of(x) + si - w.bound, 0.0) for w, si in zip(walls, s, strict=True)]
         mu = sum(float(np.sum(si * zi)) for si, zi in zip(s, z, strict=True)) / count
         open_by = max((float(np.abs(gap).max()) for gap in gaps), default=0.0)
-        if mu < 1e-11 * size and open_by < 1e-12 and float(np.abs(stationary).max()) < 1e-9 * size:
+        if mu < 1e-10 * first and open_by < 1e-10:
             break
         M = H.copy()
-        for (S, _, _), si, zi in zip(walls, s, z, strict=True):
-            M.add_differences(S, zi / si)
-        factor = M.factor()
-
-        def direction(targets: list[Array]) -> tuple[Array, list[Array], list[Array]]:
-            right = -stationary  # noqa: B023
-            for (S, _, _), si, zi, gap, t in zip(walls, s, z, gaps, targets, strict=True):  # noqa: B023
-                right = right - _transposed(S, (t + zi * gap) / si - zi, k)
-            dx = cho_solve_banded((factor, True), right.ravel(), check_finite=False).reshape(k, n)  # noqa: B023
-            ds = [np.where(on, -gap - _difference(S, dx), 0.0) for (S, _, on), gap in zip(walls, gaps, strict=True)]  # noqa: B023
-            dz = [(t - zi * d) / si - zi for t, zi, d, si in zip(targets, z, ds, s, strict=True)]
-            return dx, ds, [np.where(on, d, 0.0) for (_, _, on), d in zip(walls, dz, strict=True)]
-
-        dx, ds, dz = direction([np.zeros_like(si) for si in s])
+        for w, si, zi in zip(walls, s, z, strict=True):
+            M.add_differences(w.stencil, zi / si / w.width**2)
+        newton = _Newton(M.factor(), stationary, gaps, s, z, walls, (k, n))
+        dx, ds, dz = newton.direction([np.zeros_like(si) for si in s])
         share = _share(s, ds, z, dz, 1.0)
-        ahead = sum(float(np.sum((si + share * d) * (zi + share * e))) for si, d, zi, e in zip(s, ds, z, dz, strict=True))
+        ahead = sum(
+            float(np.sum((si + share * d) * (zi + share * e)))
+            for si, d, zi, e in zip(s, ds, z, dz, strict=True)
+        )
         center = (max(ahead, 0.0) / count / mu) ** 3 * mu if mu > 0 else 0.0
-        dx, ds, dz = direction(
-            [np.where(on, center - d * e, 0.0) for d, e, (_, _, on) in zip(ds, dz, walls, strict=True)]
+        dx, ds, dz = newton.direction(
+            [np.where(w.on, center - d * e, 0.0) for d, e, w in zip(ds, dz, walls, strict=True)]
         )
         share = _share(s, ds, z, dz, 0.995)
         x = x + share * dx
         s = [np.maximum(si + share * d, 1e-300) for si, d in zip(s, ds, strict=True)]
         z = [zi + share * e for zi, e in zip(z, dz, strict=True)]
     return x
+
+
+class _Newton(NamedTuple):
+    """The linear system of one interior-point step."""
+
+    factor: Array
+    stationary: Array
+    gaps: list[Array]
+    s: list[Array]
+    z: list[Array]
+    walls: list[_Wall]
+    shape: tuple[int, int]
+
+    def direction(self, targets: list[Array]) -> tuple[Array, list[Array], list[Array]]:
+        """Steps of x, slacks and multipliers towards s z = targets."""
+        right = -self.stationary
+        for w, si, zi, gap, t in zip(self.walls, self.s, self.z, self.gaps, targets, strict=True):
+            right = right - w.back((t + zi * gap) / si - zi, self.shape[0])
+        dx = cho_solve_banded((self.factor, True), right.ravel(), check_finite=False).reshape(self.shape)
+        ds = [np.where(w.on, -gap - w.of(dx), 0.0) for w, gap in zip(self.walls, self.gaps, strict=True)]
+        dz = [(t - zi * d) / si - zi for t, zi, d, si in zip(targets, self.z, ds, self.s, strict=True)]
+        return dx, ds, [np.where(w.on, d, 0.0) for w, d in zip(self.walls, dz, strict=True)]
 
 
 def _share(s: list[Array], ds: list[Array], z: list[Array], dz: list[Array], back: float) -> float:

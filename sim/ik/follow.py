@@ -85,7 +85,10 @@ class Follower:
         self.space, self.kinematics = Space(model), Kinematics(model)
         self.q = self.space.check(model.qpos0 if q0 is None else q0)
         self.v: Array = np.zeros(model.nv)
-        self.v_max, self.a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
+        self.v_max, self.a_max = (
+            limit("velocity", velocity, model.nv),
+            limit("acceleration", acceleration, model.nv),
+        )
         self.clearance = clearance
         self.apart = Clearance(model, apart, reach=10 * clearance + 0.1) if apart else None
         self.names = [f"{a} near {b}" for a, b in apart]
@@ -144,7 +147,9 @@ class Follower:
         b = np.array([_SHARE * (gap.distance - self.clearance) for gap, _ in near])
         return A, b, [name for _, name in near]
 
-    def _held(self, columns: NDArray[np.intp], active: NDArray[np.intp], n: int, names: list[str]) -> tuple[str, ...]:
+    def _held(
+        self, columns: NDArray[np.intp], active: NDArray[np.intp], n: int, names: list[str]
+    ) -> tuple[str, ...]:
         mask = np.zeros(self.model.nv, dtype=bool)
         mask[columns[active[active < 2 * n] % n]] = True
         walls = active[(active >= 2 * n) & (active < 2 * n + len(names))] - 2 * n
@@ -159,7 +164,9 @@ def limit(name: str, value: ArrayLike | None, nv: int) -> Array:
     return out
 
 
-def step_box(below: Array, above: Array, v: Array, v_max: Array, a_max: Array, dt: float) -> tuple[Array, Array]:
+def step_box(
+    below: Array, above: Array, v: Array, v_max: Array, a_max: Array, dt: float
+) -> tuple[Array, Array]:
     """Least and greatest step (nv,) with limits `below` <= 0 <= `above` away (see the module's text)."""
 
     def braking(room: Array) -> Array:

@@ -91,7 +91,9 @@ class Motion:
             name = name_of(model, "joint", j)
             if kind == FREE:
                 place = keyed(self.t, self.q[:, q : q + 3], kind="natural")
-                tracks[name] = FreeTrack(place, keyed_rotation(self.t, self.q[:, q + 3 : q + 7], kind="natural"))
+                tracks[name] = FreeTrack(
+                    place, keyed_rotation(self.t, self.q[:, q + 3 : q + 7], kind="natural")
+                )
             elif kind == BALL:
                 tracks[name] = keyed_rotation(self.t, self.q[:, q : q + 4], kind="natural")
             else:
@@ -134,7 +136,9 @@ class _Line:
     def __init__(self, model: mujoco.MjModel, goals: Goals, t: Array, joints: Sequence[str] | None):
         self.model, self.t, self.space = model, t, Space(model)
         kinematics = Kinematics(model)
-        self.problems = [Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t]
+        self.problems = [
+            Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t
+        ]
         self.moved = np.any([p.moved for p in self.problems], axis=0)
 
     def rows(self, q: Array) -> list[tuple[Array, Array]]:
@@ -147,7 +151,9 @@ class _Line:
         return out
 
 
-def _first_guess(line: _Line, q0: ArrayLike | None, start: ArrayLike | None, v_max: Array, a_max: Array) -> Array:
+def _first_guess(
+    line: _Line, q0: ArrayLike | None, start: ArrayLike | None, v_max: Array, a_max: Array
+) -> Array:
     """The start that differential inverse kinematics follows best, and its motion (k, nq)."""
     model = line.model
     first = line.problems[0]
@@ -215,7 +221,9 @@ def _motion(line: _Line, q: Array, limits: Limits) -> Motion:
     off = np.array([not all(r.met for r in rs) for rs in judged])
     missed = _stretches(line, q, off, position, rotation)
     arrays = [frozen(x) for x in (line.t, q, v, a, position, rotation)]
-    return Motion(line.model, *arrays, missed, limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max))
+    return Motion(
+        line.model, *arrays, missed, limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max)
+    )
 
 
 def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:
@@ -232,6 +240,13 @@ def _stretches(
         once = solve(line.model, line.problems[k].goals, q0=q[k], restarts=60)
         verdict = None if once.solved else once.verdict
         out.append(
-            Missed(float(line.t[i]), float(line.t[j - 1]), float(line.t[k]), float(position[k]), float(rotation[k]), verdict)
+            Missed(
+                float(line.t[i]),
+                float(line.t[j - 1]),
+                float(line.t[k]),
+                float(position[k]),
+                float(rotation[k]),
+                verdict,
+            )
         )
     return tuple(out)
