@@ -53,6 +53,8 @@ def _estimate_adaptive(engine: Engine, problem: Problem, segment: Segment) -> Er
     assert problem.tolerance is not None
     tighter = dataclasses.replace(problem, tolerance=max(problem.tolerance / 100, 1e-14))
     finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), None)
+    if finer.status == "interrupted":
+        raise KeyboardInterrupt
     n = min(len(finer.t), len(segment.t))
     angle, length = np.full((2, len(segment.t)), np.inf)
     angle[:n], length[:n] = difference(problem.model, segment.q[:n], finer.q[:n])
