@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -67,6 +68,10 @@ class Goal(ABC):
     def units(self) -> tuple[Unit, ...]:
         """Unit of every row before rows are left free."""
 
+    def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
+        """Unit of every row on `model`; differs from `units` for goals whose rows follow from the model."""
+        return self.units()
+
     @abstractmethod
     def rows(self, c: Configurations) -> Rows:
         """Residuals and Jacobian over a batch."""
@@ -88,6 +93,9 @@ class Goal(ABC):
 
     def errors(self, r: Array) -> tuple[Array, Array]:
         """Size of residuals (n, m): (n,) in metres and (n,) in radians, free rows left out."""
+        if len(self.units()) == 1:
+            size = _norm(r)
+            return (size, np.zeros(len(r))) if self.units()[0] == "m" else (np.zeros(len(r)), size)
         kept = np.isfinite(self.tolerances())
         metres = np.array([u == "m" for u in self.units()])
         return _norm(r[:, metres & kept]), _norm(r[:, ~metres & kept])
@@ -97,7 +105,8 @@ def _norm(x: Array) -> Array:
     return np.asarray(np.linalg.norm(x, axis=1)) if x.shape[1] else np.zeros(len(x))
 
 
-def _vector(name: str, x: ArrayLike, n: int = 3) -> Array:
+def vector(name: str, x: ArrayLike, n: int = 3) -> Array:
+    """`x` as n finite floats; ModelError with `name` otherwise."""
     out = np.array(x, dtype=float)
     if out.shape != (n,) or not np.isfinite(out).all():
         raise ModelError(f"{name} must be {n} finite numbers, not {x!r}")
@@ -105,7 +114,7 @@ def _vector(name: str, x: ArrayLike, n: int = 3) -> Array:
 
 
 def _unit(name: str, x: ArrayLike, n: int = 3) -> Array:
-    out = _vector(name, x, n)
+    out = vector(name, x, n)
     length = np.linalg.norm(out)
     if length < 1e-12:
         raise ModelError(f"{name} is zero: it gives no direction")
@@ -134,7 +143,7 @@ class Position(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "target", _vector("target", self.target))
+        object.__setattr__(self, "target", vector("target", self.target))
 
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
@@ -194,7 +203,7 @@ class Pose(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "position", _vector("position", self.position))
+        object.__setattr__(self, "position", vector("position", self.position))
         object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
 
     @cached_property
@@ -229,7 +238,7 @@ class LookAt(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "target", _vector("target", self.target))
+        object.__setattr__(self, "target", vector("target", self.target))
         object.__setattr__(self, "axis", _unit("axis", self.axis))
 
     def frames(self) -> tuple[str, ...]:
@@ -261,7 +270,7 @@ class PointOnLine(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "point", vector("point", self.point))
         object.__setattr__(self, "direction", _unit("direction", self.direction))
 
     def frames(self) -> tuple[str, ...]:
@@ -286,7 +295,7 @@ class PointOnPlane(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "point", vector("point", self.point))
         object.__setattr__(self, "normal", _unit("normal", self.normal))
 
     def frames(self) -> tuple[str, ...]:
@@ -311,7 +320,7 @@ class Distance(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.to, str):
-            object.__setattr__(self, "to", _vector("to", self.to))
+            object.__setattr__(self, "to", vector("to", self.to))
         if not self.distance >= 0:
             raise ModelError(f"a distance is not negative: {self.distance}")
 
@@ -341,7 +350,7 @@ class CenterOfMass(Goal):
     target: ArrayLike
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "target", _vector("target", self.target))
+        object.__setattr__(self, "target", vector("target", self.target))
         super().__post_init__()
 
     @property
@@ -384,17 +393,18 @@ class JointValue(Goal):
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         mask = np.zeros(kinematics.model.nv, dtype=bool)
-        mask[_scalar_joint(kinematics, self.joint)[1]] = True
+        mask[scalar_joint(kinematics, self.joint)[1]] = True
         return mask
 
     def rows(self, c: Configurations) -> Rows:
-        q, v = _scalar_joint(c.kinematics, self.joint)
+        q, v = scalar_joint(c.kinematics, self.joint)
         J = np.zeros((len(c.q), 1, c.model.nv))
         J[:, 0, v] = 1.0
         return Rows(c.q[:, q : q + 1] - self.value, J)
 
 
-def _scalar_joint(kinematics: Kinematics, name: str) -> tuple[int, int]:
+def scalar_joint(kinematics: Kinematics, name: str) -> tuple[int, int]:
+    """Addresses in q and v of a hinge or slide; ModelError for other joints."""
     model = kinematics.model
     j = lookup(model, "joint", name)
     if int(model.jnt_type[j]) not in SCALAR:
@@ -418,11 +428,8 @@ class Posture(Goal):
     def units(self) -> tuple[Unit, ...]:
         return ("rad",)
 
-    def errors(self, r: Array) -> tuple[Array, Array]:
-        return np.zeros(len(r)), _norm(r)
-
-    def tolerances(self) -> Array:
-        return np.full(1, self.tolerance, dtype=float)
+    def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
+        return ("rad",) * int(model.nv)
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         return np.ones(kinematics.model.nv, dtype=bool)
@@ -453,7 +460,7 @@ class Mirror(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "normal", _unit("normal", self.normal))
-        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "point", vector("point", self.point))
 
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.of) if self.relative_to is None else (self.at, self.of, self.relative_to)

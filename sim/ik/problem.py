@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...models.naming import joint_names, lookup, name_of
 from ..errors import ModelError, unknown
-from .goals import BAND, Goal, Posture, Rows
+from .goals import BAND, Goal, Rows
 from .loops import Closure, closures
 from .pose import Kinematics
 from .space import Space
@@ -65,9 +65,10 @@ class Problem:
         at = 0
         for goal, judge in zip(self.goals, strict, strict=True):
             t = goal.tolerances()
-            is_metres = np.array([u == "m" for u in goal.units()])
-            if isinstance(goal, Posture):  # a row for every freedom
-                t, is_metres = np.full(self.model.nv, t[0]), np.zeros(self.model.nv, dtype=bool)
+            row_units = goal.row_units(self.model)
+            is_metres = np.array([u == "m" for u in row_units])
+            if len(t) != len(row_units):
+                t = np.full(len(row_units), t[0])
             units = np.where(is_metres, 1.0 / scale, 1.0)
             groups.append(Group(goal.label, goal, slice(at, at + len(t))))
             metres.append(is_metres)

@@ -22,7 +22,7 @@ from .goals import (
     PointOnPlane,
     Pose,
     Position,
-    _scalar_joint,
+    scalar_joint,
 )
 from .problem import Problem
 from .reach import at_point, offset, path, placed, planar, reach, turning_gap
@@ -61,7 +61,7 @@ def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
     if isinstance(goal, (PointOnPlane, PointOnLine)):
         position, by = _surface_gap(problem, goal, q), "the reach of the chain"
     if isinstance(goal, JointValue):
-        _, v = _scalar_joint(problem.kinematics, goal.joint)
+        _, v = scalar_joint(problem.kinematics, goal.joint)
         low, high = problem.space.low[v], problem.space.high[v]
         rotation, by = max(0.0, low - goal.value, goal.value - high), "the joint's range"
     return Gap(position, rotation, by) if position > 0 or rotation > 0 else NO_GAP
@@ -248,7 +248,7 @@ def _rates(problem: Problem, goal: Goal, columns: Array) -> Array | None:
         return None
     out = np.zeros((len(columns), 2))
     if isinstance(goal, JointValue):
-        out[columns == _scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
+        out[columns == scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
         return out
     if getattr(goal, "relative_to", None) is not None:
         return None

@@ -17,12 +17,12 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...models.naming import name_of
 from ..clip import Clip, FreeTrack, Track
 from ..curves import keyed
 from ..errors import ModelError
 from ..kinds import BALL, FREE
 from ..rotation_curves import keyed_rotation
-from ...models.naming import name_of
 from .band import Limits, smoothest_step
 from .follow import Follower, frozen, limit
 from .goals import Goal
