@@ -120,22 +120,33 @@ def _sites(eq: Equations, kind: str) -> Tape:
     return eq.tape("q w p", {"p": places, "R": [x for pose in poses for row in pose.R for x in row]})
 
 
-def _held_residual(eq: Equations, kind: str, tau: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
-    """Accelerations, and the equations' residual with those held fixed."""
-    a = eq.acceleration(kind, tau)
-    held = [eq.graph.hold(x) for x in a]
-    return a, eq.residual_local(held, tau)
+class _Implicit:
+    """Derivatives of the accelerations from those of the equations' residual with the accelerations held.
 
+    r(a_local, s) = 0 gives d a_local = -M^-1 dr; the world sees d(R a_local) = R d a_local + dR a_local.
+    """
 
-def _implicit(
-    eq: Equations, residual: Sequence[Scalar], seeds: Sequence[Mapping[Node, Scalar]]
-) -> list[list[Scalar]]:
-    """Derivatives of the accelerations along `seeds`: -M^-1 times those of the residual."""
-    out = []
-    for column in directional(residual, seeds):
-        solved = eq.world(eq.factor.solve([-x for x in column]))
-        out.append(eq.free(solved))
-    return out
+    def __init__(self, eq: Equations, kind: str, tau: Sequence[Scalar]):
+        self.eq, self.kind = eq, kind
+        a_local = eq.acceleration_local(kind, tau)
+        self.a = eq.seen(a_local)
+        held = [eq.graph.hold(x) for x in a_local]
+        self.residual, self.seen = eq.residual_local(held, tau), eq.seen(held)
+
+    def along(self, seeds: Sequence[Mapping[Node, Scalar]]) -> list[list[Scalar]]:
+        """Derivatives along `seeds`, one column each."""
+        eq, out = self.eq, []
+        turned = directional(self.seen, seeds)
+        for column, turn in zip(directional(self.residual, seeds), turned, strict=True):
+            solved = eq.free(eq.world(eq.factor.solve([-x for x in column])))
+            out.append(spatial.add(solved, turn))
+        return out
+
+    def weighted(self, bar: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        """Rows and weights whose weighted sum has the gradient of bar . a."""
+        eq = self.eq
+        solved = eq.solve_local(eq.local(eq.spread(bar)), self.kind)
+        return [*self.residual, *self.seen], [*(-eq.graph.hold(x) for x in solved), *bar]
 
 
 def _inverse_mass(eq: Equations) -> list[list[Scalar]]:
@@ -156,21 +167,20 @@ def _rows(columns: list[list[Scalar]], height: int) -> list[Scalar]:
 def _derivatives(eq: Equations, kind: str) -> Tape:
     """Of the accelerations by q (tangent), v and tau."""
     lay = eq.layout
-    a, residual = _held_residual(eq, kind, eq.inputs["tau"])
-    turned = [eq.tangent(k) for k in range(lay.nv)]
-    by_q = _implicit(eq, residual, turned)
-    by_v = _implicit(eq, residual, [{x: 1.0} for x in eq.inputs["v"]])
-    outputs = {"a": a, "dq": _rows(by_q, lay.nv), "dv": _rows(by_v, lay.nv)}
+    implicit = _Implicit(eq, kind, eq.inputs["tau"])
+    by_q = implicit.along([eq.tangent(k) for k in range(lay.nv)])
+    by_v = implicit.along([{x: 1.0} for x in eq.inputs["v"]])
+    outputs = {"a": implicit.a, "dq": _rows(by_q, lay.nv), "dv": _rows(by_v, lay.nv)}
     return eq.tape(STATE, outputs | {"dtau": [x for row in _inverse_mass(eq) for x in row]})
 
 
 def _control_derivatives(eq: Equations, kind: str) -> Tape:
     """Of the accelerations by activations, controls and parameters."""
     lay = eq.layout
-    _, residual = _held_residual(eq, kind, eq.inputs["tau"])
+    implicit = _Implicit(eq, kind, eq.inputs["tau"])
     outputs = {}
     for name in ("act", "u", "p"):
-        columns = _implicit(eq, residual, [{x: 1.0} for x in eq.inputs[name]])
+        columns = implicit.along([{x: 1.0} for x in eq.inputs[name]])
         outputs["d" + name] = _rows(columns, lay.nv)
     return eq.tape(STATE, outputs)
 
@@ -178,26 +188,15 @@ def _control_derivatives(eq: Equations, kind: str) -> Tape:
 def _rate_jacobian(eq: Equations, kind: str) -> Tape:
     """Of dx/dt by x (plain coordinates, quaternions included), u and p."""
     zero: list[Scalar] = [0.0] * eq.layout.nv
-    _, residual = _held_residual(eq, kind, zero)
+    implicit = _Implicit(eq, kind, zero)
     outputs = {"rate": _rate_terms(eq, kind)}
     kinematic, activation = eq.coordinate_rate(), eq.actuation[1]
     for name, keys in (("x", ("q", "v", "act")), ("u", ("u",)), ("p", ("p",))):
         seeds = [{node: 1.0} for key in keys for node in eq.inputs[key]]
         q_part, act_part = directional(kinematic, seeds), directional(activation, seeds)
-        columns = [
-            [*q, *a, *s] for q, a, s in zip(q_part, _implicit(eq, residual, seeds), act_part, strict=True)
-        ]
+        columns = [[*q, *a, *s] for q, a, s in zip(q_part, implicit.along(seeds), act_part, strict=True)]
         outputs["d" + name] = _rows(columns, eq.layout.nx)
     return eq.tape("q v act u w p", outputs)
-
-
-def _adjoint(
-    eq: Equations, kind: str, bar: Sequence[Scalar], tau: Sequence[Scalar]
-) -> tuple[list[Scalar], list[Scalar]]:
-    """Residual with accelerations held, and the multipliers -M^-1 bar (held) of its rows."""
-    _, residual = _held_residual(eq, kind, tau)
-    solved = eq.solve_local(eq.local(eq.spread(bar)), kind)
-    return residual, [-eq.graph.hold(x) if isinstance(x, Node) else -x for x in solved]
 
 
 def _pulled_back(eq: Equations, by_q: Sequence[Scalar]) -> list[Scalar]:
@@ -212,9 +211,9 @@ def _pulled_back(eq: Equations, by_q: Sequence[Scalar]) -> list[Scalar]:
 def _vjp(eq: Equations, kind: str) -> Tape:
     """bar . d(accelerations): by q (tangent), v, act, u, tau and p."""
     bar = eq.inputs["bar"][: eq.layout.nv]
-    residual, weights = _adjoint(eq, kind, bar, eq.inputs["tau"])
+    rows, weights = _Implicit(eq, kind, eq.inputs["tau"]).weighted(bar)
     names = ("q", "v", "act", "u", "tau", "p")
-    by = _gradients(eq, residual, weights, names)
+    by = _gradients(eq, rows, weights, names)
     return eq.tape(STATE + " bar", {"q": _pulled_back(eq, by["q"])} | {n: by[n] for n in names[1:]})
 
 
@@ -222,8 +221,8 @@ def _rate_vjp(eq: Equations, kind: str) -> Tape:
     """bar . d(dx/dt): by x (plain coordinates), u and p."""
     lay, bar = eq.layout, eq.inputs["bar"]
     zero: list[Scalar] = [0.0] * lay.nv
-    residual, weights = _adjoint(eq, kind, bar[lay.nq : lay.nq + lay.nv], zero)
-    rows = [*eq.coordinate_rate(), *residual, *eq.actuation[1]]
+    rows, weights = _Implicit(eq, kind, zero).weighted(bar[lay.nq : lay.nq + lay.nv])
+    rows = [*eq.coordinate_rate(), *rows, *eq.actuation[1]]
     by = _gradients(
         eq, rows, [*bar[: lay.nq], *weights, *bar[lay.nq + lay.nv : lay.nx]], ("q", "v", "act", "u", "p")
     )

@@ -147,10 +147,8 @@ class Equations:
         return applied_wrenches(self.fields, self.tree, self.where, self.v, self.gravity)
 
     def inertial_local(self, a: Sequence[Scalar], gravity: Sequence[spatial.Vector]) -> list[Scalar]:
-        """Rigid-body forces at the accelerations `a` of all freedoms, without armature."""
-        return generalized_forces(
-            self.tree, self.where, self.v, self.local(a), gravity, self._wrenches, self.model.nv
-        )
+        """Rigid-body forces at the local accelerations `a` of all freedoms, without armature."""
+        return generalized_forces(self.tree, self.where, self.v, a, gravity, self._wrenches, self.model.nv)
 
     @cached_property
     def mass_local(self) -> Entries:
@@ -172,24 +170,28 @@ class Equations:
 
     def acceleration(self, formulation: str, tau: Sequence[Scalar] | None = None) -> list[Scalar]:
         """Accelerations of the state's freedoms under actuators, passive forces and `tau`."""
-        bias = self.inertial_local(self.prescribed, self._felt)
-        a = self.world(self.solve_local(spatial.sub(self.local(self.driving(tau)), bias), formulation))
-        return self.free(self._with_gravity(a, 1.0))
+        return self.seen(self.acceleration_local(formulation, tau))
 
-    def _with_gravity(self, a: Sequence[Scalar], sign: float) -> list[Scalar]:
-        out = list(a)
+    def acceleration_local(self, formulation: str, tau: Sequence[Scalar] | None) -> list[Scalar]:
+        """Accelerations of all freedoms that do not come from falling (zero for the keyed ones)."""
+        bias = self.inertial_local(self.local(self.prescribed), self._felt)
+        return self.solve_local(spatial.sub(self.local(self.driving(tau)), bias), formulation)
+
+    def seen(self, a_local: Sequence[Scalar]) -> list[Scalar]:
+        """What the world sees of local accelerations, falling included, over the state's freedoms."""
+        out = self.world(a_local)
         for dof in self.falling:
-            out[dof : dof + 3] = spatial.add(out[dof : dof + 3], spatial.scale(sign, self.gravity))
-        return out
+            out[dof : dof + 3] = spatial.add(out[dof : dof + 3], self.gravity)
+        return self.free(out)
 
-    def residual_local(self, a: Sequence[Scalar], tau: Sequence[Scalar]) -> list[Scalar]:
-        """M a + c - forces, which vanishes at the solution; `a` over the state's freedoms.
+    def residual_local(self, a_local: Sequence[Scalar], tau: Sequence[Scalar]) -> list[Scalar]:
+        """M a + c - forces, which vanishes at the local accelerations of the solution.
 
-        Its derivative by anything, times -M^-1, is that of the acceleration.
+        Its derivative by anything, times -M^-1, is that of `acceleration_local`.
         """
-        full = spatial.add(self._with_gravity(self.spread(a), -1.0), self.prescribed)
+        full = spatial.add(a_local, self.local(self.prescribed))
         inertial = self.inertial_local(full, self._felt)
-        rotors = [m * x for m, x in zip(self.armature, self.local(full), strict=True)]
+        rotors = [m * x for m, x in zip(self.armature, full, strict=True)]
         return spatial.sub(spatial.add(inertial, rotors), self.local(self.driving(tau)))
 
     def coordinate_rate(self) -> list[Scalar]:
@@ -209,7 +211,7 @@ class Equations:
     def inverse(self, a: Sequence[Scalar]) -> list[Scalar]:
         """Forces on all freedoms, beside passive ones, that produce `a` (state) and the prescribed motion."""
         full = spatial.add(self.spread(a), self.prescribed)
-        inertial = self.inertial_local(full, [self.gravity] * len(self.tree.links))
+        inertial = self.inertial_local(self.local(full), [self.gravity] * len(self.tree.links))
         rotors = [m * x for m, x in zip(self.armature, full, strict=True)]
         return spatial.sub(spatial.add(self.world(inertial), rotors), self.passive)
 
