@@ -315,14 +315,20 @@ def simulate(
     baud: Annotated[int, typer.Option(help="Bit rate of servos given by model.")] = 1_000_000,
     loss: Annotated[float, typer.Option(help="Part of packets that is lost.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Of the losses.")] = 0,
+    physics: Annotated[
+        bool, typer.Option("--physics", help="Servos of a rig carry its model: gravity, inertia, contacts.")
+    ] = False,
 ) -> None:
     """Virtual servos on a pseudo-terminal, which any program opens as a serial port. Ctrl-C ends it."""
-    from .connect import virtual_bus
     from .virtual import FaultPlan, PtyServer, VirtualBus, VirtualServo, WireFault
+    from .virtual_rig import virtual_bus
 
     faults = FaultPlan(wire=(WireFault("lost", loss),) if loss else (), seed=seed)
     if len(what) == 1 and _is_rig(what[0]):
-        bus = virtual_bus(load_rig(what[0]), faults=faults)
+        rig = load_rig(what[0])
+        bus = virtual_bus(rig, model=rig.load_model() if physics else None, faults=faults)
+    elif physics:
+        raise HardwareError("--physics needs a rig whose file names its model, not models of servos")
     else:
         servos = [VirtualServo(m, i, baud=baud) for i, m in enumerate(what, start=1)]
         bus = VirtualBus(servos, faults=faults)

@@ -10,49 +10,15 @@ from numpy.typing import NDArray
 
 from .driver import Driver
 from .errors import HardwareError
-from .mapping import joint_bounds, make_bounds, make_mapping
 from .ports import latency_of, open_port
 from .rig import VIRTUAL, Rig
-from .virtual import NO_FAULTS, FaultPlan, Quirks, Timing, VirtualBus, VirtualServo
+from .virtual import VirtualBus
+from .virtual_rig import virtual_bus
 
 Array = NDArray[np.float64]
 
 REAL_MARGIN = 8e-3  # s beyond the wire's time: scheduling of host and adapter
 TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind it
-
-
-def rest_pose(rig: Rig) -> Array:
-    """Joint values (nj,) as near to zero as soft limits and servos allow."""
-    mapping, servos, joints = make_mapping(rig), make_bounds(rig), joint_bounds(rig)
-    zero = (joints.low <= 0) & (joints.high >= 0)
-    q = np.where(zero, 0.0, np.clip(0.0, joints.low, joints.high))
-    s = np.clip(mapping.servo(q), servos.low, servos.high)
-    return mapping.joint(s)
-
-
-def virtual_bus(
-    rig: Rig,
-    *,
-    pose: Array | None = None,
-    faults: FaultPlan = NO_FAULTS,
-    timing: Timing | None = None,
-    firmware: int | None = None,
-    quirks: Quirks | None = None,
-) -> VirtualBus:
-    """Virtual servos of a rig, standing at joint values `pose` (nj,), torque off, as after power-on."""
-    s = make_mapping(rig).servo(rest_pose(rig) if pose is None else np.asarray(pose, dtype=float))
-    servos = [
-        VirtualServo(
-            item.model,
-            item.id,
-            baud=rig.baud,
-            position=float(angle),
-            firmware=firmware,
-            quirks=quirks or Quirks(),
-        )
-        for item, angle in zip(rig.servos, s, strict=True)
-    ]
-    return VirtualBus(servos, timing=timing or Timing(), faults=faults)
 
 
 def connect(

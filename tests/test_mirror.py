@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
-from pantograph.hardware.connect import connect, virtual_bus
+from pantograph.hardware.connect import connect
 from pantograph.hardware.limits import MotionRefused
 from pantograph.hardware.mapping import make_mapping
 from pantograph.hardware.mirror import RigFault, Session, mirror_live, mirror_recording
 from pantograph.hardware.mirror.teleop import teleoperate
 from pantograph.hardware.rig import RigError, load_rig, parse_rig
 from pantograph.hardware.virtual import FaultPlan, VirtualBus, VirtualServo, WireFault
+from pantograph.hardware.virtual_rig import virtual_bus
 from pantograph.models.library import data_robots
 from pantograph.sim.recording import load
 from pantograph.sim.run import run
@@ -329,6 +331,32 @@ def test_live_simulation_that_fails_stops_the_rig(tmp_path) -> None:
     with pytest.raises(Exception, match="simulation"):
         mirror_live(scene, rig, bus=bus, stop="limp")
     assert not any(s.get("torque_enable") for s in bus.servos)
+
+
+def test_virtual_rig_that_carries_its_robot_sags_as_its_gain_says() -> None:
+    """At rest the torque of two servos, kt P e V / R each with error e, is that of gravity, m g l sin(q)."""
+    mass, rod = 0.4, 0.2
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><body><joint name="elbow" axis="0 1 0" damping="0.02" armature="0.01"/>
+        <inertial pos="0 0 {-rod}" mass="{mass}" diaginertia="1e-6 1e-6 1e-6"/>
+        <body pos="0 0 {-rod}"><joint name="wrist" axis="0 1 0" armature="0.01" damping="0.02"/>
+        <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/></body></body></worldbody></mujoco>"""
+    )
+    rig = parse_rig(RIG)
+    bus = virtual_bus(rig, model=model, pose=np.array([0.1, 0.0]))
+    session = session_of(rig, bus)
+    goal = session.mapping.servo(np.array([1.2, 0.0]))
+    outcome = session.run(goal, lambda t: goal, 1.0)
+    assert outcome.status == "done"
+    bus.advance(2.0)
+    servo = bus[1]
+    q = servo.drive.position
+    drive = servo.drive
+    p = drive.settings.position_gains[0]
+    torque = drive.motor.kt * p * (goal[0] - q) * drive.voltage / drive.motor.resistance
+    assert abs(drive.velocity) < 1e-3
+    assert np.isclose(2 * torque, mass * 9.81 * rod * np.sin(q), rtol=0.03)
+    assert 0.005 < goal[0] - q < 0.2
 
 
 def leader_bus(rig, motion) -> VirtualBus:

@@ -1,11 +1,12 @@
-"""A simulation that runs a little ahead of the rig that follows it, window by window, in its own thread."""
+"""A simulation that runs a little ahead of the rig that follows it, in a process of its own."""
 
 from __future__ import annotations
 
-import dataclasses
+import pickle
 import queue
+import subprocess
+import sys
 import threading
-from math import ceil
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,9 +15,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.compose import make_engine, make_law
-from ...sim.control import Sampled
-from ...sim.engines.interface import Controls, Held, Problem, State
 from ...sim.plan import Plan, make_plan
 from ...sim.scene.load import load_scene
 from ...sim.scene.schema import Scene
@@ -26,23 +24,13 @@ from ..motion import Motion
 from ..rig import Rig
 
 Array = NDArray[np.float64]
+Window = tuple[Array, Array, Array]
 
-WINDOW = 0.1  # s of motion that are computed at once, about
 AHEAD = 3  # windows that are computed before they are needed
 
 
-class _Later:
-    """Controls whose first tick is tick `first` of the whole run."""
-
-    def __init__(self, controls: Controls, first: int) -> None:
-        self.period, self._controls, self._first = controls.period, controls, first
-
-    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
-        return self._controls.sample(self._first + k, t, q, v)
-
-
 class Live:
-    """A running simulation as a source of joint values.
+    """A running simulation as a source of joint values; a context manager.
 
     Args:
         scene: What runs.
@@ -56,33 +44,31 @@ class Live:
         if isinstance(scene, str | Path):
             scene = load_scene(scene)
         plan = scene if isinstance(scene, Plan) else make_plan(scene)
-        self.problem: Problem = plan.problem
         self.model: mujoco.MjModel = plan.problem.model
-        self.duration = self.problem.steps * self.problem.step
-        base = plan.setup.scene
-        self.scene: dict[str, Any] = base.model_dump(mode="json", exclude_defaults=True)
+        self.duration = plan.problem.steps * plan.problem.step
+        self._scene = plan.setup.scene
+        self.scene: dict[str, Any] = self._scene.model_dump(mode="json", exclude_defaults=True)
         self.patient = patient
         self.starved = 0  # targets that the simulation had not computed in time
         self._qpos, self._dofs = indices(rig, mapping, self.model)
-        self._engine = make_engine(plan.engine.what)
-        self._controls: Controls | None = None
-        if plan.period is not None:
-            item = base.controller
-            law = make_law(item.law if item else "pd", plan.problem, item.parameters if item else {})
-            self._controls = Sampled(law, plan.problem, plan.period)
-        self._window = _window(self.problem, plan.period)
-        self._ready: queue.Queue[tuple[Array, Array, Array] | str] = queue.Queue(AHEAD)
-        self._parts: list[tuple[Array, Array, Array]] = []
+        self._ready: queue.Queue[Window | str] = queue.Queue(AHEAD)
+        self._parts: list[Window] = []
         self._current: Motion | None = None
         self._failure = ""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._compute, name="live simulation", daemon=True)
-        self.first: Array = self.problem.state0.q[self._qpos].copy()
+        self._thread = threading.Thread(target=self._receive, name="live simulation", daemon=True)
+        self.first: Array = plan.problem.state0.q[self._qpos].copy()
 
     def __enter__(self) -> Live:
+        program = f"{__package__}.windows"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self._process.stdin is not None
+        pickle.dump(self._scene, self._process.stdin)
+        self._process.stdin.close()
         self._thread.start()
-        while len(self._parts) < 1:
-            self._take(wait=True)
+        self._take(wait=True)
         self.first = self._parts[0][1][0][self._qpos]
         return self
 
@@ -90,12 +76,11 @@ class Live:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stop.set()
-        while self._thread.is_alive():
-            try:
-                self._ready.get(timeout=0.05)
-            except queue.Empty:
-                continue
+        self._process.kill()
+        self._process.wait()
         self._thread.join()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -137,6 +122,7 @@ class Live:
         if isinstance(item, str):
             self._failure = item
             if not self._parts:
+                self._process.kill()
                 raise HardwareError(f"the simulation did not start: {item}")
             return True
         self._parts.append(item)
@@ -145,39 +131,24 @@ class Live:
         self._current = Motion(t, q, v, np.zeros_like(v))
         return True
 
-    def _compute(self) -> None:
-        """The thread: windows, one after the other, each from the state where the last ended."""
-        problem, h = self.problem, self.problem.step
-        state, step = problem.state0, 0
-        try:
-            while step < problem.steps and not self._stop.is_set():
-                n = min(self._window, problem.steps - step)
-                controls = self._controls
-                if controls is not None:
-                    controls = _Later(controls, round(step * h / controls.period))
-                part = dataclasses.replace(problem, state0=state)
-                segment = self._engine.run(part, (step * h, (step + n) * h), controls)
-                if segment.status != "done":
-                    self._put(segment.message or segment.status)
-                    return
-                self._put((segment.t, segment.q, segment.v))
-                state = State(segment.q[-1].copy(), segment.v[-1].copy(), segment.act[-1].copy())
-                step += n
-        except Exception as e:
-            self._put(str(e))
+    def _receive(self) -> None:
+        """The thread: from the process to the queue."""
+        assert self._process.stdout is not None
+        while not self._stop.is_set():
+            try:
+                item = pickle.load(self._process.stdout)
+            except (EOFError, pickle.UnpicklingError):
+                item = "its process ended"
+            if item is None:
+                return
+            self._put(item)
+            if isinstance(item, str):
+                return
 
-    def _put(self, item: tuple[Array, Array, Array] | str) -> None:
+    def _put(self, item: Window | str) -> None:
         while not self._stop.is_set():
             try:
                 self._ready.put(item, timeout=0.1)
                 return
             except queue.Full:
                 continue
-
-
-def _window(problem: Problem, period: float | None) -> int:
-    """Steps of a window: whole samples and whole controller periods."""
-    steps = problem.sample_every
-    if period is not None:
-        steps = int(np.lcm(steps, round(period / problem.step)))
-    return steps * max(1, ceil(WINDOW / (steps * problem.step)))

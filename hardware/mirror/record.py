@@ -102,6 +102,8 @@ class MirrorReport:
                 f"  {self.timing.cycles} cycles, {self.timing.skipped} skipped; jitter {p50:.3f} ms median, "
                 f"{p99:.3f} ms 99 %, {most:.3f} ms greatest; busy {self.timing.busy * 1e3:.2f} ms a cycle"
             )
+            rates = (f"up to {rate:.4g} Hz {n}" for rate, n in self.timing.histogram if n)
+            lines.append(f"  cycles by rate: {', '.join(rates)}")
         s = self.packets
         lines.append(
             f"  packets: {s.sent} sent, {s.received} received, {s.lost} answers lost, {s.corrupt} corrupt, "

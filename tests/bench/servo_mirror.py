@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 from dynamixel_sdk import PacketHandler
-from pantograph.hardware.connect import connect, virtual_bus
+from pantograph.hardware.connect import connect
 from pantograph.hardware.mirror import Session
 from pantograph.hardware.mirror.contract import prepare
 from pantograph.hardware.mirror.loop import Log, Loop
 from pantograph.hardware.packets import Instruction
 from pantograph.hardware.rig import Rig, parse_rig
 from pantograph.hardware.virtual import FaultPlan, VirtualBus, WireFault
+from pantograph.hardware.virtual_rig import virtual_bus
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
