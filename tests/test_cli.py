@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pantograph.sim import Scene, load, load_scene, make_plan
+from pantograph.sim import Scene, load, load_scene, make_plan, run
 from pantograph.sim.cli.app import run_app
 
 SCENES = Path(__file__).parents[1] / "models" / "scenes"
@@ -123,6 +123,21 @@ def test_a_diverged_run_has_exit_code_1_and_is_saved(pantograph, folder):
     assert r.status == "diverged"
     assert "(diverged)" in out
     assert (folder / "out" / "p.png").is_file()
+
+
+def test_a_run_interrupted_at_once_is_saved_and_not_drawn(pantograph, folder, monkeypatch):
+    module = sys.modules[run.__module__]
+
+    def stop(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "run", lambda plan, **_: run(plan, progress=stop))
+    (folder / "swing.toml").write_text(SWING + '[solver]\nengine = "contact"\n')
+    code, _, err = pantograph("run", "swing.toml", "--plot", "p.png")
+    assert code == 130
+    assert err.startswith("interrupted: interrupted at t = ")
+    assert load(folder / "out" / "swing.npz").status == "interrupted"
+    assert not (folder / "out" / "p.png").exists()
 
 
 def test_notes_of_what_was_crossed_are_printed(pantograph, folder):

@@ -76,7 +76,8 @@ def run(
     console.print(show.summary(recording))
     show.notes(console, recording)
     console.print(f"recording: {saved}")
-    _draw(recording, film, plot, out)
+    if recording.status == "done" or len(recording.t) > 1:
+        _draw(recording, film, plot, out)
     _finish(recording)
     if mirror is not None:
         _mirror(recording, mirror, port, slow, stop, out / f"{scene.stem}-rig.npz")
