@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mapping import Mapping, indices, joint_bounds, make_bounds, make_mapping
+from .registers import control_table
 from .rig import Rig
-from .virtual import NO_FAULTS, FaultPlan, Plant, Quirks, Timing, VirtualBus, VirtualServo, joints
+from .virtual import MOTORS, NO_FAULTS, FaultPlan, Plant, Quirks, Timing, VirtualBus, VirtualServo, joints
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,11 @@ def virtual_bus(
 
 
 class Robot:
-    """A robot whose joints are moved by torques of servos; friction and rotor inertia are the model's."""
+    """A robot whose joints are moved by torques of servos; friction is the model's.
+
+    Rotor inertia is the model's or, where that is less, what the virtual motors have, seen through the
+    transmission at its steepest: back-EMF on less inertia would be too stiff for the servo's period of 1 ms.
+    """
 
     def __init__(self, rig: Rig, mapping: Mapping, model: mujoco.MjModel, pose: Array) -> None:
         self.mapping = mapping
@@ -67,6 +72,15 @@ class Robot:
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
         self.data = mujoco.MjData(self.model)
         self._qpos, self._dofs = indices(rig, mapping, model)
+        bounds = joint_bounds(rig, model)
+        path = np.linspace(np.clip(bounds.low, -np.pi, np.pi), np.clip(bounds.high, -np.pi, np.pi), 65)
+        servo_v = np.abs([mapping.rates(path, row, np.zeros_like(path))[0] for row in np.eye(len(pose))])
+        rotors = np.array([MOTORS[control_table(s.model).model].inertia for s in rig.servos])
+        reflected = (servo_v.max(axis=1) ** 2) @ rotors  # J_q = sum (ds/dq)^2 J
+        armature = self.model.dof_armature
+        armature[self._dofs] = np.maximum(np.ravel(armature[self._dofs]), reflected).reshape(
+            armature[self._dofs].shape
+        )
         self.data.qpos[self._qpos] = pose
         for e in range(model.neq):  # the other finger of a gripper starts where its equality has it
             if model.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT and model.eq_obj2id[e] >= 0:

@@ -428,3 +428,8 @@ def test_real_robots_mirror_to_virtual_rigs(name: str, keys: dict[str, list[floa
     q = report.recording.q
     if name == "wx250s":
         assert np.allclose(q[:, -1], -q[:, -2])  # the other finger follows
+    rig = load_rig(name)
+    heavy = mirror_recording(run(scene), rig, slow=True, bus=virtual_bus(rig, model=rig.load_model()))
+    assert heavy.status == "done"
+    worst = max(t.rms_aligned for t in heavy.tracking)
+    assert max(t.rms_aligned for t in report.tracking) < worst < 0.12  # it sags under its own weight
