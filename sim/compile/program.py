@@ -151,19 +151,19 @@ class Program:
 
 
 class Bound:
-    """A program on fixed arrays for one state: write the inputs, call, read the outputs; costs no more than
-    the call itself.
+    """A program on arrays of its own: write the inputs, call, read the outputs; nothing is allocated.
 
-    `inputs` and `outputs` are the arrays by name.
+    `inputs` and `outputs` are the arrays by name, shape (size,), or (count, size) for a batch.
     """
 
-    def __init__(self, program: Program):
-        self.inputs = {name: np.zeros(size) for name, size in program.inputs.items()}
-        self.outputs = {name: np.zeros(size) for name, size in program.outputs.items()}
-        arguments = [x for array in self.inputs.values() for x in (address(array), 0)]
+    def __init__(self, program: Program, count: int = 1):
+        lead = () if count == 1 else (count,)
+        self.inputs = {name: np.zeros((*lead, size)) for name, size in program.inputs.items()}
+        self.outputs = {name: np.zeros((*lead, size)) for name, size in program.outputs.items()}
+        arguments = [x for array in self.inputs.values() for x in (address(array), array.shape[-1])]
         arguments += [address(array) for array in self.outputs.values()]
-        self._program, self._function, self._arguments = program, program.function, tuple(arguments)
+        self._program, self._function, self._arguments = program, program.function, (count, *arguments)
 
     def __call__(self) -> None:
-        """Compute the outputs from the inputs."""
-        self._function(1, *self._arguments)
+        """Compute the outputs from the inputs, in this thread."""
+        self._function(*self._arguments)

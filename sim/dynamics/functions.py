@@ -167,7 +167,7 @@ def _rows(columns: list[list[Scalar]], height: int) -> list[Scalar]:
 def _derivatives(eq: Equations, kind: str) -> Tape:
     """Of the accelerations by q (tangent), v and tau."""
     lay = eq.layout
-    implicit = _Implicit(eq, kind, eq.inputs["tau"])
+    implicit = _Implicit(eq, "composite", eq.inputs["tau"])  # whose factor the columns need anyway
     by_q = implicit.along([eq.tangent(k) for k in range(lay.nv)])
     by_v = implicit.along([{x: 1.0} for x in eq.inputs["v"]])
     outputs = {"a": implicit.a, "dq": _rows(by_q, lay.nv), "dv": _rows(by_v, lay.nv)}
@@ -177,7 +177,7 @@ def _derivatives(eq: Equations, kind: str) -> Tape:
 def _control_derivatives(eq: Equations, kind: str) -> Tape:
     """Of the accelerations by activations, controls and parameters."""
     lay = eq.layout
-    implicit = _Implicit(eq, kind, eq.inputs["tau"])
+    implicit = _Implicit(eq, "composite", eq.inputs["tau"])
     outputs = {}
     for name in ("act", "u", "p"):
         columns = implicit.along([{x: 1.0} for x in eq.inputs[name]])
@@ -188,8 +188,8 @@ def _control_derivatives(eq: Equations, kind: str) -> Tape:
 def _rate_jacobian(eq: Equations, kind: str) -> Tape:
     """Of dx/dt by x (plain coordinates, quaternions included), u and p."""
     zero: list[Scalar] = [0.0] * eq.layout.nv
-    implicit = _Implicit(eq, kind, zero)
-    outputs = {"rate": _rate_terms(eq, kind)}
+    implicit = _Implicit(eq, "composite", zero)
+    outputs = {"rate": _rate_terms(eq, "composite")}
     kinematic, activation = eq.coordinate_rate(), eq.actuation[1]
     for name, keys in (("x", ("q", "v", "act")), ("u", ("u",)), ("p", ("p",))):
         seeds = [{node: 1.0} for key in keys for node in eq.inputs[key]]

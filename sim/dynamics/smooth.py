@@ -212,9 +212,9 @@ class Smooth:
             found = self._programs[name, lanes] = Program(code, lanes)
         return found
 
-    def bind(self, name: str) -> Bound:
-        """Function `name` on its own arrays, for the quickest calls on one state."""
-        return Bound(self.program(name, 1))
+    def bind(self, name: str, count: int = 1) -> Bound:
+        """Function `name` on arrays of its own, for the quickest calls on one state or `count` of them."""
+        return Bound(self.program(name, 1 if count == 1 else self.lanes), count)
 
     @property
     def stats(self) -> Stats:
