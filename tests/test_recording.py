@@ -239,6 +239,15 @@ def test_a_failed_save_leaves_the_old_file(recording, saved, tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["r.npz"]
 
 
+def test_who_reads_the_old_file_is_not_disturbed_by_a_new_one(recording, saved, tmp_path):
+    path = tmp_path / "r.npz"
+    path.write_bytes(b"the old file")
+    with path.open("rb") as reader:
+        recording.save(path)
+        assert reader.read() == b"the old file"
+    assert path.read_bytes() == saved
+
+
 def test_saving_makes_folders_and_files_that_others_may_read(recording, tmp_path):
     path = recording.save(tmp_path / "a" / "b" / "r.npz")
     assert path == tmp_path / "a" / "b" / "r.npz"
