@@ -74,14 +74,14 @@ def candidates(problem: Problem, start: Array) -> Array:
 
 def _chain(f: Frame, problem: Problem, start: Array) -> _Chain | None:
     """Axes of the joints that move; None for joints other than hinges and balls."""
-    from .reach import standing
+    from .reach import stood
 
     joints, axes, T = [], [], np.eye(4)
     for joint in f.joints:
-        T = T @ joint.X
         if not problem.moved[joint.v]:
-            T = T @ standing(joint, start)
+            T = stood(T, joint, start)
             continue
+        T = T @ joint.X
         if int(joint.type) not in (HINGE, BALL):
             return None
         joints.append(joint)

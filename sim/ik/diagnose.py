@@ -202,7 +202,7 @@ def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> tupl
     starts = np.concatenate([end.q, search.best.q[:6]])
     feasible = descend(held, starts)
     part = Search(held, search.start, restarts=24, seed=3)
-    more = [feasible.q[feasible.met], part.solutions(np.zeros((0, held.space.nq)), every=True)]
+    more = [feasible.q[feasible.met], part.more(24)]
     q = np.concatenate(more)
     if not len(q):
         return 0.0, None

@@ -17,7 +17,7 @@ from .settle import Wish
 Array = NDArray[np.float64]
 Preference = Literal["near", "middle", "manipulability", "clear"]
 PREFERENCES: tuple[Preference, ...] = ("near", "middle", "manipulability", "clear")
-_FAINT = 1e-3  # preferences beside wishes: rows this much smaller
+_FAINT = 1e-4  # preferences beside wishes: rows this much smaller
 
 
 class Wishes(NamedTuple):

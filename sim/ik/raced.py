@@ -17,7 +17,7 @@ from .goals import BAND, Orientation, Pose, Position
 from .pose import Kinematics, parse_frame
 from .problem import Problem
 from .race import Raced, Racer, racer
-from .reach import standing
+from .reach import stood
 from .space import Space
 from .step import Chain, fits
 
@@ -98,12 +98,11 @@ def moving_part(f: Frame, moved: NDArray[np.bool_], start: Array) -> Frame:
     """The frame with only the joints that move; the others stand as in `start` (nq,)."""
     joints, X = [], np.eye(4)
     for joint in f.joints:
-        X = X @ joint.X
         if moved[joint.v]:
-            joints.append(joint._replace(X=X))
+            joints.append(joint._replace(X=X @ joint.X))
             X = np.eye(4)
         else:
-            X = X @ standing(joint, start)
+            X = stood(X, joint, start)
     return replace(f, joints=tuple(joints), X_end=X @ f.X_end)
 
 

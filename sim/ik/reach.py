@@ -149,13 +149,14 @@ def _hops(
     turns: list[Turn] = []
     T, travels, start = np.eye(4), [], None
     for joint in joints:
-        T = T @ joint.X
         kind = int(joint.type)
         if not moved[joint.v]:
-            T = T @ standing(joint, q)
-        elif kind == FREE:
+            T = stood(T, joint, q)
+            continue
+        T = T @ joint.X
+        if kind == FREE:
             return None
-        elif kind == SLIDE:
+        if kind == SLIDE:
             travels.append(
                 Travel(T[:3, 2], space.low[joint.v] - joint.rest, space.high[joint.v] - joint.rest)
             )
@@ -169,8 +170,8 @@ def _hops(
     return hops[0], hops[1:], turns
 
 
-def standing(joint: Any, q: Array) -> Array:
-    """Pose (4, 4) across a joint that stands at q (nq,)."""
+def stood(T: Array, joint: Any, q: Array) -> Array:
+    """Pose (4, 4) behind a joint that stands at q (nq,), from the pose before it; a free joint's is in q."""
     X = np.eye(4)
     kind = int(joint.type)
     if kind == SLIDE:
@@ -182,7 +183,8 @@ def standing(joint: Any, q: Array) -> Array:
         X[:3, :3] = rotations.to_matrix(rotations.normalize(q[at : at + 4]))
         if kind == FREE:
             X[:3, 3] = q[joint.q : joint.q + 3]
-    return X
+            return X
+    return np.asarray(T @ joint.X @ X)
 
 
 def reach(p: Path) -> Reach:

@@ -44,46 +44,48 @@ class Search:
             np.zeros((0, problem.space.nq)), np.zeros((0, m)), np.zeros(0), 0, np.zeros(0, dtype=bool)
         )
 
-    def solutions(self, first: Array, *, every: bool = False) -> Array:
+    def solutions(self, first: Array) -> Array:
         """Configurations (k, nq) that meet the problem: from `first` (k, nq), the start, then random starts.
 
-        All that were found, so possibly many alike; none (0, nq) when all restarts failed. With `every`, all
-        restarts are used.
+        All that were found, so possibly many alike; none (0, nq) when all restarts failed.
         """
         space, moved = self.problem.space, self.problem.moved
         found = [np.zeros((0, space.nq))]
         inside = first[space.excess(first).max(axis=1, initial=0.0) <= 1e-9]
         if len(inside):
             found.append(self._attempt(inside, iterations=12))
-        if every or not len(found[-1]):
+        if not len(found[-1]):
             starts = np.stack([self.start, space.middle(self.start, moved)])
-            found.append(self._attempt(starts, iterations=40, first=not every))
-        if every or not len(found[-1]):
-            if self.hopeless is not None and not every and self.hopeless():
+            found.append(self._attempt(starts, iterations=40, first=True))
+        if not len(found[-1]):
+            if self.hopeless is not None and self.hopeless():
                 self.restarts = min(self.restarts, sum(_BLOCKS[:2]))
             else:
-                found.append(self._raced(every=every))
+                found.append(self._raced())
         blocks = iter(_BLOCKS)
         size = next(blocks)
-        while self.used < self.restarts and (every or not sum(map(len, found))):
+        while self.used < self.restarts and not sum(map(len, found)):
             n = min(size, self.restarts - self.used)
-            q = space.random(self.rng, n, self.start, moved)
-            self.used += n
-            found.append(self._attempt(q, first=not every))
+            found.append(self._attempt(self._random(n), first=True))
             size = next(blocks, size)
         return np.concatenate(found)
 
-    def _raced(self, *, every: bool) -> Array:
-        """Solutions of compiled searches, where the goal is a pose of one chain."""
+    def more(self, n: int) -> Array:
+        """Further solutions (k, nq), from the start, mid-range and n random starts."""
+        middle = self.problem.space.middle(self.start, self.problem.moved)
+        return self._attempt(np.concatenate([self.start[None], middle[None], self._random(n)]))
+
+    def _random(self, n: int) -> Array:
+        self.used += n
+        return self.problem.space.random(self.rng, n, self.start, self.problem.moved)
+
+    def _raced(self) -> Array:
+        """A solution by compiled searches, where the goal is a pose of one chain."""
         racer = racer_of(self.problem, self.start)
         if racer is None:
             return np.zeros((0, self.problem.space.nq))
         middle = self.problem.space.middle(self.start, self.problem.moved)
-        starts = np.stack([self.start, middle])
-        if every:
-            random = self.problem.space.random(self.rng, self.restarts, self.start, self.problem.moved)
-            starts = np.concatenate([starts, random])
-        q, spent = racer(starts, most=_MOST if not every else _MOST // 10)
+        q, spent = racer(np.stack([self.start, middle]), most=_MOST)
         self.iterations += spent
         return self._attempt(q, iterations=12) if len(q) else q
 

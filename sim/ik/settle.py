@@ -83,7 +83,7 @@ def _step(problem: Problem, x: Array, rows: Rows, cap: float) -> Array | None:
 
 def null_space(J: Array) -> Array:
     """Orthonormal columns Z with J Z = 0, singular values below 1e-7 of the largest counted as zero."""
-    if not len(J):
+    if not J.size:
         return np.eye(J.shape[1])
     _, s, Vt = np.linalg.svd(J)
     rank = int(np.sum(s > 1e-7 * max(float(s[0]), 1e-9)))

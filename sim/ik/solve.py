@@ -61,7 +61,9 @@ def solve(
     prefers = preference(prefer, judged, start, obstacles)
     wish: Wish = prefers if wished is None else Wishes(wished, prefers)
     search = Search(judged, start, restarts=restarts, seed=seed, hopeless=lambda: excluded(judged, start))
-    found = search.solutions(candidates(judged, start), every=all)
+    found = search.solutions(candidates(judged, start))
+    if len(found) and (all or prefer != "near"):  # what is best may lie far from the start
+        found = np.concatenate([found, search.more(restarts if all else min(restarts, 40))])
     if len(found):
         best = _settled(judged, space, found, wish, start, every=all)
         verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
@@ -103,7 +105,7 @@ def _settled(judged: Problem, space: Space, found: Array, wish: Wish, start: Arr
     found = unwound(judged, found, start)
     value = np.array([np.sum(wish(q[None]).r ** 2) for q in found])
     settled = []
-    for i in np.argsort(value, kind="stable")[: None if every else 3]:
+    for i in np.argsort(value, kind="stable")[: None if every else 5]:
         end = settle(judged, found[i], wish)
         settled.append((end.value, unwound(judged, tighten(judged, end.q)[None], start)[0]))
     settled.sort(key=lambda pair: pair[0])
@@ -117,7 +119,7 @@ def distinct(space: Space, q: Array, *, apart: float = 1e-3) -> Array:
         if kept:
             d = space.difference(np.tile(x, (len(kept), 1)), np.array(kept))
             d[:, space.hinges] -= 2 * np.pi * np.round(d[:, space.hinges] / (2 * np.pi))
-            if np.abs(d).max(axis=1).min() <= apart:
+            if np.abs(d).max(axis=1, initial=0.0).min() <= apart:
                 continue
         kept.append(x)
     return np.array(kept)

@@ -1,0 +1,274 @@
+"""Inverse kinematics: verdicts against truths known by construction, laws of answers, hard cases."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import ik_cases, ik_planar
+from pantograph.models import ModelError, load_model
+from pantograph.sim import rotations
+from pantograph.sim.ik import (
+    CenterOfMass,
+    Distance,
+    JointValue,
+    LookAt,
+    Mirror,
+    Orientation,
+    PointOnLine,
+    PointOnPlane,
+    Pose,
+    Position,
+    Posture,
+    solve,
+)
+from pantograph.sim.ik.animate import Pole, Spread
+from pantograph.sim.ik.pose import Kinematics
+from pantograph.sim.ik.space import Space
+from strategies import random_states, seeds, trees
+
+FAMILIES = [*ik_cases.REACHABLE, *ik_cases.BEYOND, *ik_cases.LIMITED, *ik_cases.CONFLICT]
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("index", range(3))
+def test_verdicts_are_true(family, index):
+    case = family(np.random.default_rng([index, 77]))
+    solution = solve(case.model, case.goals)
+    assert ik_cases.mistakes(case, solution) == []
+    if case.kind == "solved":
+        assert all(r.met for r in solution.residuals)
+
+
+@settings(max_examples=25, deadline=None)
+@given(trees(), seeds)
+def test_answers_are_finite_and_within_limits_whatever_is_asked(model, seed):
+    rng = np.random.default_rng(seed)
+    for j in range(model.njnt):
+        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE and rng.random() < 0.6:
+            model.jnt_limited[j] = 1
+            half = rng.uniform(0.1, 2.5)
+            model.jnt_range[j] = (0, half) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL else (-half, half)
+    site = f"s{rng.integers(model.nsite)}"
+    far = 10.0 ** rng.integers(-3, 4)
+    goals = [Pose(site, far * rng.normal(size=3), rng.normal(size=4)), Position("s0", rng.normal(size=3))]
+    solution = solve(model, goals[: rng.integers(1, 3)], restarts=12, seed=int(rng.integers(100)))
+    assert ik_cases.illegal(model, solution.q) == []
+    assert solution.solved == all(r.met for r in solution.residuals)
+
+
+@settings(max_examples=25, deadline=None)
+@given(trees(joints=("ball", "slide", "hinge")), seeds)
+def test_a_pose_that_some_configuration_has_is_found(model, seed):
+    q = random_states(model, seed, 1)[0][0]
+    goals = [Position(f"s{k}", ik_cases.pose_of(model, q, f"s{k}")[0]) for k in range(min(2, model.nsite))]
+    assert solve(model, goals).solved
+
+
+@settings(max_examples=20, deadline=None)
+@given(trees(), seeds)
+def test_jacobians_of_goals_are_their_derivatives(model, seed):
+    rng = np.random.default_rng(seed)
+    q = random_states(model, seed, 2)[0]
+    a, b = (f"s{k}" for k in rng.integers(0, model.nsite, 2))
+    x, y, quat = rng.normal(size=3), rng.normal(size=3), rng.normal(size=4)
+    goals = [
+        Position(a, x), Position(a, x, relative_to=b), Orientation(a, quat), Pose(a, x, quat, relative_to="s0"),
+        LookAt(a, 5 * x, axis=y), PointOnLine(a, x, y), PointOnPlane(a, x, y), Distance(a, 3 * x, 1.0),
+        Posture(model.qpos0), Mirror(a, "s0", y, x, relative_to=b), Pole(a, "s0", b, x),
+    ]  # fmt: skip
+    if model.nv:
+        goals.append(CenterOfMass(x))
+    space, kinematics, h = Space(model, limits=False), Kinematics(model), 1e-6
+    for goal in goals:
+        try:
+            J = goal.rows(kinematics.at(q)).J
+        except ModelError:  # nothing that moves has mass
+            continue
+        single = goal.rows(kinematics.at(q[:1])).J.copy()
+        for v in range(model.nv):
+            d = np.zeros((2, model.nv))
+            d[:, v] = h
+            plus, minus = (goal.rows(kinematics.at(space.step(q, s * d))).r for s in (1, -1))
+            scale = 1 + np.abs(J).max()
+            np.testing.assert_allclose((plus - minus) / (2 * h), J[:, :, v], atol=3e-7 * scale**2)
+        np.testing.assert_allclose(single, J[:1], atol=1e-9)
+
+
+def test_the_planar_arm_of_the_notes():
+    model = ik_cases.planar_chain([1.0, 0.8])
+    solution = solve(model, Position("tip", [1.2, 0.7, 0]), all=True)
+    truth = ik_planar.two_links((1.0, 0.8), (1.2, 0.7))
+    assert len(solution.solutions) == 2
+    found = solution.solutions[np.argsort(solution.solutions[:, 1])[::-1]]
+    np.testing.assert_allclose(found, truth, atol=1e-12)
+    np.testing.assert_allclose(truth[0], [-0.0739531788805312790, 1.38853897167576753], atol=1e-15)
+    for target, gap in (((2, 0, 0), 0.2), ((0.1, 0, 0), 0.1)):
+        verdict = solve(model, Position("tip", target)).verdict
+        assert (verdict.kind, verdict.proved) == ("out of reach", True)
+        assert verdict.position == pytest.approx(gap, abs=1e-9)
+        assert verdict.bound == pytest.approx(gap, abs=1e-9)
+    assert solve(model, Position("tip", (1.8, 0, 0))).solved
+
+
+@pytest.mark.parametrize("beyond", [1e-12, 1e-7, 1e-5, 1e-3])
+def test_no_near_miss_passes_for_solved(beyond):
+    model = ik_cases.planar_chain([1.0, 0.8])
+    solution = solve(model, Position("tip", (1.8 + beyond, 0, 0)))
+    assert solution.solved == (beyond < 1e-6)
+    if not solution.solved:
+        assert solution.verdict.position == pytest.approx(beyond, rel=1e-3)
+
+
+def test_pose_met_only_apart_tells_both_distances():
+    """A 2R arm at a point has two headings; keeping another heading, its wrist circle misses the point."""
+    lengths, q = (1.0, 0.8), np.array([0.3, 1.1])
+    tip = ik_planar.forward(lengths, q)[-1]
+    heading = q.sum() + 0.2
+    verdict = solve(ik_cases.planar_chain(lengths), Pose("tip", [*tip, 0], ik_cases.quat_z(heading))).verdict
+    assert verdict.kind == "out of reach"
+    others = ik_planar.two_links(lengths, tip).sum(axis=1)
+    assert verdict.rotation == pytest.approx(np.abs(ik_planar.wrap(others - heading)).min(), abs=1e-6)
+    wrist = tip - lengths[1] * np.array([np.cos(heading), np.sin(heading)])
+    assert verdict.position == pytest.approx(abs(np.hypot(*wrist) - lengths[0]), abs=1e-6)
+
+
+def test_wishes_give_way_to_hard_goals_and_are_met_as_well_as_possible():
+    lengths = (1.0, 0.8, 0.5)
+    model = ik_cases.planar_chain(lengths)
+    target = (1.1, 0.6)
+    solution = solve(model, [Position("tip", [*target, 0]), JointValue("j0", 0.9, weight=1.0)])
+    assert solution.solved
+    assert solution.residuals[0].position < 1e-9
+    # j0 can be 0.9 exactly: the rest of the arm still reaches the point from there
+    assert np.hypot(*(target - ik_planar.forward(lengths[:1], [0.9])[-1])) < 1.3
+    assert solution.q[0] == pytest.approx(0.9, abs=1e-6)
+    # farther than it can be: as near as the hard goal allows, which is where the other two stand stretched
+    solution = solve(model, [Position("tip", [2.2, 0, 0]), JointValue("j0", 1.5, weight=1.0)])
+    a, b, d = 1.0, 1.3, 2.2
+    assert solution.q[0] == pytest.approx(np.arccos((a * a + d * d - b * b) / (2 * a * d)), abs=1e-4)
+
+
+def test_near_means_nearest_to_the_start():
+    lengths = (1.0, 0.8)
+    model = ik_cases.planar_chain(lengths)
+    for truth in ik_planar.two_links(lengths, (0.9, 0.7)):
+        solution = solve(model, Position("tip", [0.9, 0.7, 0]), q0=truth + [0.2, -0.1])
+        np.testing.assert_allclose(solution.q, truth, atol=1e-9)
+
+
+def test_middle_prefers_the_middle_of_the_ranges():
+    model = ik_cases.planar_chain((1.0, 0.8, 0.6), [(-2, 2)] * 3)
+    goal = Position("tip", [1.2, 0.9, 0])
+    near, middle = (solve(model, goal, q0=[1.6, -1.5, 1.9], prefer=p) for p in ("near", "middle"))
+    assert near.solved and middle.solved
+    assert np.sum(middle.q**2) < np.sum(near.q**2) - 0.1
+    low, high = model.jnt_range.T
+    qs = np.random.default_rng(0).uniform(low, high, (200_000, 3))  # nothing that meets the goal is nearer
+    angles = np.cumsum(qs, axis=1)
+    tips = np.stack([np.cos(angles) @ [1.0, 0.8, 0.6], np.sin(angles) @ [1.0, 0.8, 0.6]], axis=1)
+    close = np.linalg.norm(tips - [1.2, 0.9], axis=1) < 0.01
+    assert np.sum(middle.q**2) < np.sum(qs[close] ** 2, axis=1).min() + 0.03
+
+
+def test_tolerances_leave_room_per_axis():
+    model = ik_cases.planar_chain((1.0, 0.8))
+    high = Position("tip", [1.2, 0.3, 0.5], tolerance=(1e-6, 1e-6, np.inf))
+    assert solve(model, high).solved
+    spun = Pose("tip", [*ik_planar.forward((1.0, 0.8), [0.3, 0.5])[-1], 0], ik_cases.quat_z(2.0),
+                tolerance=(1e-6, 1e-6, 1e-6, 1e-6, 1e-6, np.inf))  # fmt: skip
+    assert solve(model, spun).solved
+    band = Position("tip", [1.85, 0, 0], tolerance=(0.1, 1e-6, 1e-6))
+    assert solve(model, band).solved
+    assert not solve(model, Position("tip", [1.85, 0, 0], tolerance=(0.04, 1e-6, 1e-6))).solved
+
+
+def test_pinned_feet_and_the_centre_of_mass_of_a_free_puppet():
+    model = load_model("puppet")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    feet = [Position(f"{side}_foot", data.site(f"{side}_foot").xpos.copy()) for side in ("left", "right")]
+    hand = data.site("left_hand").xpos + [0.12, 0.02, 0.1]
+    middle = 0.5 * (feet[0].target + feet[1].target)
+    com = CenterOfMass([middle[0], middle[1], 0.0], tolerance=(1e-6, 1e-6, np.inf))
+    solution = solve(model, [*feet, Position("left_hand", hand), com])
+    assert solution.solved
+    data.qpos[:] = solution.q
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.site("left_hand").xpos, hand, atol=1e-6)
+    np.testing.assert_allclose(data.subtree_com[0][:2], middle[:2], atol=1e-6)
+
+
+def test_mirror_line_plane_and_sight():
+    model = load_model("puppet")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hand = data.site("right_hand").xpos + [0.15, -0.05, 0.2]
+    goals = [Position("right_hand", hand), Mirror("left_hand", "right_hand"),
+             LookAt("gaze", hand, axis=(1, 0, 0), tolerance=1e-5)]  # fmt: skip
+    joints = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name != "root"]
+    solution = solve(model, goals, joints=joints)
+    assert solution.solved
+    data.qpos[:] = solution.q
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.site("left_hand").xpos, hand * [1, -1, 1], atol=1e-6)
+    np.testing.assert_array_equal(solution.q[:7], model.qpos0[:7])
+
+
+def test_the_same_question_has_the_same_answer():
+    case = ik_cases.reachable_pose(np.random.default_rng(3))
+    one, two = (solve(case.model, case.goals, seed=4) for _ in range(2))
+    np.testing.assert_array_equal(one.q, two.q)
+
+
+def test_all_lists_every_solution_of_a_wrist_arm():
+    model = load_model("arm6")
+    q = np.array([0.4, 0.3, -0.7, 0.5, 0.8, -0.3])
+    p, quat = ik_cases.pose_of(model, q, "tip")
+    found = solve(model, Pose("tip", p, quat), all=True).solutions
+    assert any(np.allclose(x, q, atol=1e-6) for x in found)
+    flipped = q + [0, 0, 0, np.pi * (-1 if q[3] > 0 else 1), -2 * q[4], np.pi]  # the wrist's other solution
+    assert any(np.allclose(ik_planar.wrap(x - flipped), 0, atol=1e-6) for x in found)
+    for x in found:
+        np.testing.assert_allclose(ik_cases.pose_of(model, x, "tip")[0], p, atol=1e-9)
+
+
+def test_spread_shares_a_bow_among_vertebrae():
+    links = [([0, 0, 0.2 * (i > 0)], ik_cases.HINGE, (0, 1, 0), (-1, 1)) for i in range(4)]
+    model = ik_cases.chain([*links, ([0, 0, 0.2], None, None, None)])
+    solution = solve(model, [Orientation("tip", [np.cos(0.4), 0, np.sin(0.4), 0]),
+                             Spread(("j0", "j1", "j2", "j3"), (1, 2, 3, 2), weight=1.0)])  # fmt: skip
+    np.testing.assert_allclose(solution.q, 0.8 * np.array([1, 2, 3, 2]) / 8, atol=1e-5)
+
+
+def test_mistakes_are_told_in_words():
+    model = load_model("arm6")
+    with pytest.raises(ModelError, match="tip"):
+        solve(model, Position("tipp", [0, 0, 0]))
+    with pytest.raises(ModelError, match="3 finite numbers"):
+        Position("tip", [0, 0])
+    with pytest.raises(ModelError, match="at least one goal"):
+        solve(model, [])
+    with pytest.raises(ModelError, match="elbow"):
+        solve(model, Position("tip", [0, 0, 0]), joints=["elbo"])
+    with pytest.raises(ModelError, match="zero"):
+        Orientation("tip", [0, 0, 0, 0])
+    with pytest.raises(ModelError, match="6 finite numbers"):
+        solve(model, Position("tip", [0, 0, 0]), q0=[0, 1])
+    with pytest.raises(ModelError, match="manipulability"):
+        solve(model, Position("tip", [0, 0, 0]), prefer="manipulable")
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.integers(1, 6))
+def test_steps_and_differences_are_inverse(seed, _):
+    model = load_model("puppet")
+    q, v, _ = random_states(model, seed, 3)
+    space = Space(model, limits=False)
+    d = np.clip(v, -1, 1)
+    np.testing.assert_allclose(space.difference(space.step(q, d), space.clip(q)), d, atol=1e-9)
+    truth = q.copy()
+    for row, step in zip(truth, d, strict=True):
+        mujoco.mj_integratePos(model, row, step, 1.0)
+    np.testing.assert_allclose(space.step(q, d), truth, atol=1e-9)
+    assert rotations.normalize(q[:, 3:7]).shape == (3, 4)
