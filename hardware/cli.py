@@ -430,7 +430,13 @@ def play_recording(
 
     screen = to or console
     loaded = load_rig(rig) if isinstance(rig, str | Path) else rig
-    options: dict[str, Any] = {"stop": _stop_word(stop), "port": port, "take_over": take_over, "paced": paced}
+    options: dict[str, Any] = {
+        "stop": _stop_word(stop),
+        "port": port,
+        "take_over": take_over,
+        "paced": paced,
+        "on_phase": lambda phase: screen.print(f"[dim]{phase}"),
+    }
     length = getattr(recording, "duration", None)
     if length is None:
         length = float(recording.t[-1] - recording.t[0]) if hasattr(recording, "t") else None

@@ -18,7 +18,7 @@ from .virtual_rig import virtual_bus
 Array = NDArray[np.float64]
 
 REAL_MARGIN = 8e-3  # s beyond the wire's time: scheduling of host and adapter
-TERMINAL_MARGIN = 25e-3  # s: a pseudo-terminal has another busy process behind it
+TERMINAL_MARGIN = 100e-3  # s: a pseudo-terminal has another busy process behind it
 
 
 def connect(

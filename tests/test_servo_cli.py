@@ -130,7 +130,8 @@ def test_terminated_play_stops_as_promised(rig: Path, recording: Path) -> None:
             stdout=subprocess.PIPE,
             text=True,
         )
-        time.sleep(4.0)  # start-up of the interpreter, ramp, some of the eight seconds
+        wait_for(play, "stream")
+        time.sleep(0.7)
         play.send_signal(signal.SIGTERM)
         out, _ = play.communicate(timeout=10)
         assert play.returncode == 130 and "interrupted in phase" in out and "limp: torque is off" in out
