@@ -20,8 +20,8 @@ from ..sim.scene.load import locate
 from ..sim.scene.mistakes import Mistake, Path_, report
 from ..sim.scene.schema import Item
 from ..sim.scene.values import Finite, Positive
-from .errors import HardwareError, RegisterError, unknown
-from .registers import control_table, model_names
+from .errors import HardwareError, unknown
+from .rig_checks import contradictions
 
 Stop = Literal["hold", "park", "limp"]
 Range = tuple[Finite, Finite]
@@ -255,7 +255,7 @@ def parse_rig(text: str, *, file: str = "rig", base: Path | None = None) -> Rig:
     except tomllib.TOMLDecodeError as e:
         raise RigError(f"{file}: not valid TOML: {e}") from None
     lines = locate(text)
-    mistakes = check_data(data)
+    mistakes = contradictions(data)
     rig = None
     try:
         rig = Rig(**data)
@@ -266,107 +266,6 @@ def parse_rig(text: str, *, file: str = "rig", base: Path | None = None) -> Rig:
     assert rig is not None
     rig._file, rig._base, rig._lines = file, base, lines
     return rig
-
-
-def check_data(data: dict[str, Any]) -> list[Mistake]:
-    """What contradicts itself between the tables of a rig file; malformed items are left to the schema."""
-    out: list[Mistake] = []
-    servos = _tables(data, "servos")
-    names = [s.get("name") for s in servos]
-    for i, servo in enumerate(servos):
-        for key in ("name", "id"):
-            earlier = [s.get(key) for s in servos[:i]]
-            if servo.get(key) in earlier and servo.get(key) is not None:
-                out.append(Mistake(("servos", i, key), f"{servo[key]!r} is used by an earlier servo already"))
-        if isinstance(servo.get("model"), str):
-            try:
-                table = control_table(servo["model"])
-            except RegisterError:
-                out.append(
-                    Mistake(
-                        ("servos", i, "model"),
-                        unknown("servo model", servo["model"], model_names(), where="Pantograph"),
-                    )
-                )
-            else:
-                out += _servo_model(i, servo, table, data)
-    used: dict[str, str] = {}
-    in_differential = [j for d in _tables(data, "differentials") for j in d.get("joints", [])]
-    for place, servo_name, joint in _drives(data):
-        if servo_name not in names:
-            out.append(
-                Mistake(place, unknown("servo", str(servo_name), [n for n in names if n], where="this rig"))
-            )
-        elif servo_name in used:
-            out.append(Mistake(place, f"servo {servo_name!r} moves joint {used[servo_name]!r} already"))
-        used[servo_name] = joint
-    for i, joint_ in enumerate(_tables(data, "joints")):
-        name = joint_.get("joint")
-        if name in [j.get("joint") for j in _tables(data, "joints")[:i]]:
-            out.append(Mistake(("joints", i, "joint"), f"joint {name!r} stands here twice"))
-        if not (joint_.get("servo") or joint_.get("servos") or name in in_differential):
-            out.append(Mistake(("joints", i), f'no servo moves joint {name!r}; add servo = "..."'))
-    for i, d in enumerate(_tables(data, "differentials")):
-        for k, joint in enumerate(d.get("joints", [])):
-            if joint not in [j.get("joint") for j in _tables(data, "joints")]:
-                out.append(
-                    Mistake(
-                        ("differentials", i, "joints", k),
-                        f"joint {joint!r} needs a table [[joints]] of its own",
-                    )
-                )
-    for i, name in enumerate(names):
-        if name is not None and name not in used:
-            out.append(
-                Mistake(("servos", i), f"servo {name!r} moves no joint; name it in one, or leave it out")
-            )
-    for key in ("servos", "joints"):
-        for i, item in enumerate(_tables(data, key)):
-            r = item.get("range")
-            if (
-                isinstance(r, list)
-                and len(r) == 2
-                and all(isinstance(x, int | float) for x in r)
-                and r[0] >= r[1]
-            ):
-                out.append(Mistake((key, i, "range"), f"range must rise: [{r[0]:g}, {r[1]:g}]"))
-    return out
-
-
-def _servo_model(i: int, servo: dict[str, Any], table: Any, data: dict[str, Any]) -> list[Mistake]:
-    out = []
-    baud = data.get("baud", 1_000_000)
-    if isinstance(baud, int) and baud not in table.bauds.values():
-        known = ", ".join(f"{b:_}" for b in table.bauds.values())
-        out.append(Mistake(("baud",), f"{table.model} has no bit rate {baud:_}; it has: {known}"))
-    if servo.get("current") is not None and 5 not in table.modes:
-        with_current = ", ".join(n for n in model_names() if 5 in control_table(n).modes)
-        out.append(
-            Mistake(
-                ("servos", i, "current"), f"{table.model} does not control current; these do: {with_current}"
-            )
-        )
-    return out
-
-
-def _drives(data: dict[str, Any]) -> list[tuple[Path_, str, str]]:
-    """(place, servo, joint) of every mention of a servo by a joint."""
-    out: list[tuple[Path_, str, str]] = []
-    for i, j in enumerate(_tables(data, "joints")):
-        name = str(j.get("joint"))
-        if isinstance(j.get("servo"), str):
-            out.append((("joints", i, "servo"), j["servo"], name))
-        for k, d in enumerate(_tables(j, "servos")):
-            out.append((("joints", i, "servos", k), str(d.get("servo")), name))
-    for i, d in enumerate(_tables(data, "differentials")):
-        for k, s in enumerate(d.get("servos", [])):
-            out.append((("differentials", i, "servos", k), str(s), "/".join(map(str, d.get("joints", [])))))
-    return out
-
-
-def _tables(data: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    value = data.get(key)
-    return [v for v in value if isinstance(v, dict)] if isinstance(value, list) else []
 
 
 def check_model(rig: Rig, model: mujoco.MjModel) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 
 import mujoco
 import numpy as np
@@ -23,10 +24,12 @@ from pantograph.hardware.mapping import (
     within_joints,
 )
 from pantograph.hardware.motion import Loads, Motion, loads_of, motion_of
-from pantograph.hardware.rig import RigError, check_model, load_rig, parse_rig
+from pantograph.hardware.rig import Rig, RigError, check_model, load_rig, parse_rig
+from pantograph.hardware.rig_checks import contradictions
 from pantograph.models.library import data_robots
 from pantograph.sim.run import run
 from pantograph.sim.scene.schema import Scene
+from pydantic import ValidationError
 
 needs_data = pytest.mark.skipif(
     "wx250s" not in data_robots(), reason="the data folder with wx250s and dynamixel_2r is not there"
@@ -395,3 +398,32 @@ def _pendulum_recording(xml: str):
         path.write_text(xml)
         keys = [{"joint": "j", "times": [0, 0.5, 1, 2], "values": [0.2, 1, -0.5, 0.1]}]
         return run(Scene(duration=2, models=[{"file": str(path)}], keys=keys))
+
+
+def broken_values() -> st.SearchStrategy[object]:
+    words = st.sampled_from(["a", "left", ""])
+    plain = st.one_of(st.none(), st.booleans(), st.integers(-5, 300), st.floats(), words)
+    tables = st.dictionaries(st.sampled_from("abcd"), plain, max_size=3)
+    return st.one_of(plain, tables, st.lists(st.one_of(plain, tables), max_size=3))
+
+
+@given(st.data())
+def test_any_value_in_any_place_is_told_or_accepted_but_never_a_crash(data: st.DataObject) -> None:
+    whole = tomllib.loads(EVERYTHING)
+    for _ in range(data.draw(st.integers(1, 3))):
+        item: object = whole
+        while True:
+            keys = list(item) if isinstance(item, dict) else range(len(item))
+            key = data.draw(st.sampled_from(list(keys)))
+            deeper = item[key]
+            if not isinstance(deeper, dict | list) or not deeper or data.draw(st.booleans()):
+                break
+            item = deeper
+        item[key] = data.draw(broken_values())
+    mistakes = contradictions(whole)
+    try:
+        rig = Rig(**whole)
+    except ValidationError:
+        return
+    if not mistakes:
+        make_mapping(rig)  # what has no mistake can be used
