@@ -31,9 +31,11 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'p
 
 def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
+    from ...controllers.cli import control
     from ...hardware.cli import app as servo
 
     app.add_typer(servo)
+    app.command(epilog="Example: pantograph control wave.toml --compare pd,computed-torque")(control)
     try:
         app()
     except PantographError as e:
