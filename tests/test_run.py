@@ -197,8 +197,12 @@ def test_derived_quantities_belong_to_the_recorded_state(q1, q2, v1, v2, loaded,
     assert not r.normal.any()
 
 
-def test_drive_forces_of_all_roles_are_what_inverse_dynamics_asks_for():
-    scene = Scene(**TRACKED, physics={"contacts": "none", "limits": False, "friction": False})
+@pytest.mark.parametrize("engine", ["contact", "auto"])
+@pytest.mark.parametrize("drives", [{}, {"actuators": {"*": "off"}}, {"controller": {"law": "pd"}}])
+def test_drive_forces_of_all_roles_are_what_inverse_dynamics_asks_for(drives, engine):
+    """Of the model's servos along the keys, of ideal joint forces, and of the controller's actuators."""
+    drives = {**drives, "solver": {"engine": engine}}
+    scene = Scene(**TRACKED, **drives, physics={"contacts": "none", "limits": False, "friction": False})
     r = run(scene)
     model = make_plan(scene).problem.model
     model.opt.disableflags |= int(
