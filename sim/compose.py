@@ -32,6 +32,7 @@ LAWS: dict[str, Callable[[], Callable[..., Law]]] = {
     "operational-space": _law("operational_space", "OperationalSpace"),
     "impedance": _law("impedance", "Impedance"),
     "lqr": _law("lqr", "LQR"),
+    "swing-up": _law("swing_up", "SwingUp"),
 }
 
 

@@ -1,0 +1,209 @@
+"""Control: gains, tracking, swing-up, fitting, prediction. `make bench NAME=control`.
+
+A part is a function that returns figures; the last line is one JSON object of all of them. Parts can be
+named: python tests/bench/control.py gains tracking swing_up
+"""
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from pantograph.controllers.basin import Catch, map_basin, picture
+from pantograph.controllers.design import LinearSystem, dlqr, held, lqr
+from pantograph.controllers.experiments import compare
+from pantograph.controllers.gains import force_limits
+from pantograph.controllers.nominal import Nominal
+from pantograph.controllers.swing_up import SwingUp
+from pantograph.controllers.trial import Disturbance, run_trial
+from pantograph.models import load_model
+from pantograph.sim import Scene, make_plan
+from pantograph.sim.dynamics.smooth import compile_model
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from oracles import control_gains
+
+STARTS, SWING_S, STAY_S, PERIOD = 1000, 15.0, 10.0, 0.01
+ARM = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll"]
+OUT = Path("out")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number and the bar it must reach."""
+
+    name: str
+    value: float
+    unit: str
+    bar: str
+    holds: bool
+
+
+def at_most(name: str, value: float, bar: float, unit: str) -> Figure:
+    return Figure(name, value, unit, f"<= {bar:g}", bool(value <= bar))
+
+
+def at_least(name: str, value: float, bar: float, unit: str) -> Figure:
+    return Figure(name, value, unit, f">= {bar:g}", bool(value >= bar))
+
+
+def info(name: str, value: float, unit: str) -> Figure:
+    return Figure(name, value, unit, "", True)
+
+
+def gains(console: Console) -> list[Figure]:
+    """Reference gains, residuals, and the limit of small periods."""
+    figures = []
+    for case in (
+        control_gains.double_integrator,
+        control_gains.inverted_pendulum,
+        control_gains.ctms_cart_pendulum,
+    ):
+        A, B, Q, R, K = case()
+        found = lqr(A, B, Q, R)
+        error = float(np.abs(found.K[0] - K).max() / np.abs(K).max())
+        figures.append(at_most(f"{case.__name__}: gain, relative error", error, 1e-9, ""))
+        figures.append(info(f"{case.__name__}: Riccati residual", found.residual, ""))
+        errors = []
+        for T in (4e-4, 2e-4, 1e-4):
+            n, m = B.shape
+            step = held(LinearSystem(A, B, ("x",) * n, ("u",) * m), T)
+            errors.append(np.abs(dlqr(step.A, step.B, Q * T, R * T).K - K).max())
+        order = min(np.log2(a / b) for a, b in pairwise(errors))
+        figures.append(at_least(f"{case.__name__}: discrete tends to continuous, order", order, 0.95, ""))
+    return figures
+
+
+def arm_scene(period: float, seed: int) -> Scene:
+    """The six-axis arm with ideal drives along smooth random keys, on the smooth engine."""
+    rng = np.random.default_rng(seed)
+    times = [0, 0.8, 1.6, 2.4, 3.2]
+    keys = [{"joint": j, "times": times, "values": rng.uniform(-0.6, 0.6, 5).tolist()} for j in ARM]
+    return Scene(
+        duration=3.2,
+        models=[{"file": "arm6"}],
+        roles={"tracked": ARM},
+        actuators={"*": "off"},
+        keys=[k | {"curve": "clamped"} for k in keys],
+        physics={"friction": False, "contacts": "none"},
+        controller={"law": "computed-torque", "period": period},
+        solver={"engine": "smooth", "step": period / 2},
+    )
+
+
+def tracking(console: Console) -> list[Figure]:
+    """Computed torque with an exact model; and which law keeps what with 10 % more mass."""
+    errors, ticks = [], []
+    for seed in range(5):
+        trial = run_trial(make_plan(arm_scene(1e-3, seed)), "computed-torque", {}, Disturbance())
+        errors.append(trial.figures.worst)
+        ticks.append(trial.figures.tick)
+    figures = [
+        at_most("computed torque, exact model, 1 kHz: largest error of 5 clips", max(errors), 1e-6, "rad"),
+        info("computed torque: median tick", 1e6 * float(np.median(ticks)), "us"),
+    ]
+    plan = make_plan(arm_scene(1e-3, 0))
+    heavy = Disturbance(mass=(1.1,) * plan.problem.model.nbody)
+    for law in ("pd", "pid", "computed-torque", "lqr"):
+        worst = run_trial(plan, law, {}, heavy).figures.worst
+        figures.append(info(f"10 % more mass, {law}: largest error", worst, "rad"))
+    return figures
+
+
+def swing_law(which: str, **words: float) -> tuple[mujoco.MjModel, SwingUp]:
+    model = load_model("cart_pole" if which == "cart-pole" else "acrobot")
+    if which == "cart-pole":  # half the total weight
+        limit = 0.5 * 9.81 * float(model.body_mass.sum())
+        model.actuator_ctrlrange[0] = [-limit, limit]
+    tracked = np.array([True, False]) if which == "cart-pole" else np.array([False, True])
+    return model, SwingUp(model, tracked, model.qpos0, PERIOD, **words)
+
+
+def swing_up(console: Console) -> list[Figure]:
+    """From 1,000 random starts within 15 s to the top, and 10 s there; by the smooth engine's own drives."""
+    figures = []
+    for which in ("cart-pole", "acrobot"):
+        model, law = swing_law(which)
+        begun = time.perf_counter()
+        arrived, failures = swing(console, which, model, law, STARTS, seed=0)
+        share = 1.0 - len(failures) / STARTS
+        for k, why in failures:
+            console.print(f"{which}: start {k} of seed 0 fails: {why}")
+        figures.append(at_least(f"{which}: swings up within 15 s and stays 10 s", share, 0.999, ""))
+        figures.append(info(f"{which}: median time to the top", float(np.median(arrived)), "s"))
+        figures.append(info(f"{which}: 99.9 % of times to the top", float(np.percentile(arrived, 99.9)), "s"))
+        figures.append(info(f"{which}: computing time a start", (time.perf_counter() - begun) / STARTS, "s"))
+    return figures + [basin()]
+
+
+def swing(
+    console: Console, which: str, model: mujoco.MjModel, law: SwingUp, starts: int, seed: int
+) -> tuple[np.ndarray, list[tuple[int, str]]]:
+    """Times of arrival [s] of all, and failures."""
+    rng, smooth = np.random.default_rng(seed), compile_model(model)
+    q, v = np.zeros((starts, 2)), rng.uniform(-1.0, 1.0, (starts, 2))
+    if which == "cart-pole":
+        q[:, 1] = rng.uniform(-np.pi, np.pi, starts)
+    else:
+        q = rng.uniform(-np.pi, np.pi, (starts, 2))
+    driven = int(np.flatnonzero(law.tracked)[0])
+    memory, down, off = law.begin(starts), np.zeros(starts), np.zeros(starts, dtype=bool)
+    for tick in track(range(round((SWING_S + STAY_S) / PERIOD)), which, console=console):
+        tau, memory = law.batch(q, v, memory)
+        path = smooth.rollout(q, v, tau[:, None, driven : driven + 1], step=PERIOD / 10, steps=10, hold=10)
+        q, v = path.q[:, -1].copy(), path.v[:, -1].copy()
+        x = law.catch[0].state(q, v)
+        tilt = np.abs(x[:, 1]) if which == "cart-pole" else np.abs([x[:, 0], x[:, 0] + x[:, 1]]).max(axis=0)
+        down = np.where(tilt > 0.5, (tick + 1) * PERIOD, down)
+        if which == "cart-pole":
+            low, high = model.jnt_range[0]
+            off |= (q[:, 0] < low) | (q[:, 0] > high)
+    why = [(int(k), "leaves its rail") for k in np.flatnonzero(off)]
+    why += [(int(k), f"down until {down[k]:.2f} s") for k in np.flatnonzero((down > SWING_S) & ~off)]
+    return down, why
+
+
+def basin() -> Figure:
+    """The basin of LQR for the double inverted pendulum on a cart, as a picture with its area."""
+    model = load_model("cart_double_pole")
+    catch = Catch(Nominal(model), np.array([True, False, False]), np.zeros(3), 0.005, reach=0.1, speed=1.0)
+    found = map_basin(catch, force_limits(model), (1, 2), (0.8, 1.2), points=121)
+    OUT.mkdir(exist_ok=True)
+    picture(found, ("lower angle [rad]", "upper angle, relative [rad]")).savefig(OUT / "basin.png", dpi=120)
+    return info(f"LQR basin, double pole on a cart ({OUT / 'basin.png'}): area", found.area, "rad^2")
+
+
+def robust(console: Console) -> list[Figure]:
+    """The comparison that `pantograph control` prints, on the arm."""
+    result = compare(arm_scene(2e-3, 1), ["pd", "pid", "computed-torque", "lqr"], trials=8, processes=2)
+    return [
+        info(f"8 disturbed runs, {row.variant.name}: worst RMS", row.robust, "rad") for row in result.rows
+    ]
+
+
+PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up}
+
+
+def main() -> int:
+    console = Console()
+    chosen = sys.argv[1:] or list(PARTS)
+    figures = [figure for name in chosen for figure in PARTS[name](console)]
+    table = Table(title="Control")
+    for name in ("figure", "value", "unit", "bar", "holds"):
+        table.add_column(name)
+    for f in figures:
+        table.add_row(f.name, f"{f.value:.4g}", f.unit, f.bar, "yes" if f.holds else "[red]NO[/red]")
+    console.print(table)
+    print(json.dumps({"bench": "control", "figures": [asdict(f) for f in figures]}))
+    return 0 if all(f.holds for f in figures) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

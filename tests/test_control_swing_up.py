@@ -1,0 +1,178 @@
+"""Swing-up: what energy shaping promises, what the catch holds, and arrivals in the engines."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pantograph.controllers.basin import Basin, Catch, advance, comes_home, map_basin
+from pantograph.controllers.gains import force_limits
+from pantograph.controllers.nominal import Nominal
+from pantograph.controllers.swing_up import SwingUp
+from pantograph.models import load_model
+from pantograph.sim import Scene, SceneError, make_plan, run
+from strategies import seeds
+
+FORCE = 0.5 * 0.7 * 9.81
+
+
+def cart_law(**words):
+    model = load_model("cart_pole")
+    model.actuator_ctrlrange[0] = [-FORCE, FORCE]
+    return SwingUp(model, np.array([True, False]), model.qpos0, 0.01, **words)
+
+
+def acrobot_law(**words):
+    model = load_model("acrobot")
+    return SwingUp(model, np.array([False, True]), model.qpos0, 0.01, **words)
+
+
+CART, ACROBOT = cart_law(foresight=6.0, tries=24), acrobot_law()
+
+
+def test_goals_are_upright():
+    np.testing.assert_array_equal(CART.goal, [0, 0])
+    np.testing.assert_array_equal(ACROBOT.goal, [np.pi, 0])
+    assert ACROBOT._lift == pytest.approx(2 * 9.81 * 3)
+    assert CART._lift == pytest.approx(2 * 0.2 * 9.81 * 0.3)
+    assert 1 / CART._mobility == pytest.approx(0.7 - (0.2 * 0.3) ** 2 / (0.006 + 0.2 * 0.3**2))
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_energy_shaping_makes_its_function_fall(seed):
+    """V' = -kv v_a^2 exactly, wherever the shaped force is in use and no limit cuts it."""
+    rng = np.random.default_rng(seed)
+    law = ACROBOT
+    q, v = rng.uniform(-np.pi, np.pi, (30, 2)), 3 * rng.normal(size=(30, 2))
+    gains = np.tile(np.array([[2.0, 0.5, 3.0, 0.0]]), (30, 1))
+    tau, smooth, a = law._pump(q, v, gains), law.nominal.smooth, law.a
+    w, zeta, weight, _ = gains[0]
+    kd = law._lift * weight / law._mobility
+    acc = smooth.forward(q, v, tau=tau)
+    energy = np.add(*smooth.energy(q, v)) - law.top
+    x = law.catch[0].state(q, v)[:, a]
+    rate = energy * tau[:, a] * v[:, a] + kd * v[:, a] * acc[:, a] + kd * w**2 * x * v[:, a]
+    c = np.linalg.inv(smooth.mass_matrix(q))[:, a, a]
+    shaped = kd * c + energy > 0.05 * kd * c
+    expected = -2 * zeta * w * kd * v[:, a] ** 2
+    assert shaped.sum() > 3
+    np.testing.assert_allclose(rate[shaped], expected[shaped], rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("law", [CART, ACROBOT])
+def test_the_catch_holds_what_it_takes(law):
+    """Fresh random states at the level: nearly all come home although forces are cut."""
+    catch, level = law.catch
+    rng, n = np.random.default_rng(99), 2
+    root = np.linalg.cholesky(np.linalg.inv(catch.regulator.P))
+    x = rng.normal(size=(300, 2 * n))
+    x = np.sqrt(level) * (x / np.linalg.norm(x, axis=1)[:, None]) @ root.T
+    q, v = law.goal + x[:, :n], x[:, n:]
+    np.testing.assert_allclose(catch.value(q, v), level, rtol=1e-6)
+    home = comes_home(catch, q, v, (law.low, law.high), seconds=30 / law.rate)
+    assert home.mean() > 0.85
+    far = comes_home(catch, law.goal + 6 * x[:, :n], 6 * x[:, n:], (law.low, law.high), seconds=30 / law.rate)
+    assert far.mean() < home.mean()
+
+
+def test_angles_count_modulo_a_turn():
+    catch, _ = ACROBOT.catch
+    q, v = np.array([0.3 + np.pi, -0.2]), np.array([0.1, 0.4])
+    assert catch.value(q + np.array([2 * np.pi, -4 * np.pi]), v) == pytest.approx(
+        float(catch.value(q, v)), rel=1e-9
+    )
+    np.testing.assert_allclose(catch.force(q - np.array([2 * np.pi, 0]), v), catch.force(q, v), atol=1e-9)
+
+
+@given(st.floats(1e-3, 5e-3))
+@settings(max_examples=5)
+def test_advance_is_the_engines_motion(step):
+    nominal = Nominal(load_model("double_pendulum"))
+    q, v, tau = (
+        np.array([[2.0, -1.0], [0.3, 0.4]]),
+        np.array([[0.5, 1.0], [-1.0, 2.0]]),
+        np.array([[1.0, -2.0]] * 2),
+    )
+    got = advance(nominal, q, v, tau, step, 10)
+    fine = advance(nominal, q, v, tau, step / 8, 80)
+    for a, b in zip(got, fine, strict=True):
+        np.testing.assert_allclose(a, b, atol=20 * (8 * step) ** 4)
+
+
+def scene(file, tracked, position, duration, **words):
+    return Scene(
+        duration=duration,
+        models=[{"file": file}],
+        roles={"tracked": [tracked]},
+        keys=[{"joint": tracked, "times": [0], "values": [0]}],
+        initial={"position": position},
+        controller={"law": "swing-up", "period": 0.01, **words},
+    )
+
+
+def test_a_cart_pole_of_the_scene_stands_up_and_stays():
+    """In the engine, with its own limits, from hanging; the model's drive is stronger than the bench's."""
+    recording = run(scene("cart_pole", "slide", {"hinge": 3.0}, 8.0, foresight=5.0, tries=16))
+    late = recording.t > 5.0
+    angle = np.mod(recording.q[late, 1] + np.pi, 2 * np.pi) - np.pi
+    assert np.abs(angle).max() < 0.1
+    assert np.abs(recording.q[:, 0]).max() < 1.0
+
+
+def test_weak_carts_stand_up_from_anywhere():
+    law, rng = CART, np.random.default_rng(0)
+    q, v = np.zeros((12, 2)), rng.uniform(-1, 1, (12, 2))
+    q[:, 1] = rng.uniform(-np.pi, np.pi, 12)
+    memory, worst = law.begin(12), 0.0
+    for tick in range(1500):
+        tau, memory = law.batch(q, v, memory)
+        assert np.abs(tau).max() <= FORCE * (1 + 1e-12)
+        q, v = advance(law.nominal, q, v, tau, 0.002, 5)
+        worst = max(worst, np.abs(q[:, 0]).max())
+        if tick > 1000:
+            assert np.abs(law.catch[0].state(q, v)[:, 1]).max() < 0.2
+    assert worst < 1.0
+
+
+def test_one_machine_does_what_it_does_in_a_batch():
+    law, rng = cart_law(foresight=3.0, tries=8), np.random.default_rng(2)
+    q, v = rng.normal(size=(3, 2)), rng.normal(size=(3, 2))
+    together, memory = [], law.begin(3)
+    alone, memories = [], [law.start() for _ in range(3)]
+    for _ in range(5):
+        tau, memory = law.batch(q, v, memory)
+        together.append(tau)
+        rows = [law(0.0, q[i], v[i], None, memories[i]) for i in range(3)]
+        alone.append([r[0] for r in rows])
+        memories = [r[1] for r in rows]
+        q, v = advance(law.nominal, q, v, tau, 0.005, 2)
+    np.testing.assert_allclose(alone, together, atol=1e-9)
+
+
+def test_the_basin_of_a_double_pole_lies_around_upright():
+    model = load_model("cart_double_pole")
+    tracked = np.array([True, False, False])
+    nominal, limits = Nominal(model), force_limits(model)
+    catch = Catch(nominal, tracked, np.zeros(3), 0.005, reach=0.1, speed=1.0)
+    basin = map_basin(catch, limits, (1, 2), (1.2, 1.2), points=21, seconds=5.0)
+    assert basin.home[10, 10]
+    np.testing.assert_array_equal(basin.home, basin.home[::-1, ::-1])  # the machine is symmetric
+    assert not basin.home[0].any()
+    assert 0.1 < basin.area < 2.4**2
+    assert Basin(np.array([0.0, 2.0]), np.array([0.0, 3.0]), np.array([[True, False]] * 2)).area == 3.0
+    weak = map_basin(catch, (limits[0] / 8, limits[1] / 8), (1, 2), (1.2, 1.2), points=21, seconds=5.0)
+    assert weak.area < basin.area
+
+
+def test_what_cannot_swing_up_is_told():
+    with pytest.raises(SceneError, match="exactly one tracked joint, got 2"):
+        make_plan(
+            Scene(
+                duration=1.0,
+                models=[{"file": "double_pendulum"}],
+                roles={"tracked": ["shoulder", "elbow"]},
+                controller={"law": "swing-up"},
+            )
+        )
+    with pytest.raises(SceneError, match="set the actuator's ctrlrange"):
+        make_plan(scene("double_pendulum", "elbow", {}, 1.0).model_copy(update={"actuators": {"*": "off"}}))
