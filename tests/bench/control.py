@@ -140,7 +140,7 @@ def swing_up(console: Console) -> list[Figure]:
         figures.append(info(f"{which}: median time to the top", float(np.median(arrived)), "s"))
         figures.append(info(f"{which}: 99.9 % of times to the top", float(np.percentile(arrived, 99.9)), "s"))
         figures.append(info(f"{which}: computing time a start", (time.perf_counter() - begun) / STARTS, "s"))
-    return figures + [basin()]
+    return [*figures, basin()]
 
 
 def swing(
