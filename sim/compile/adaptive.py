@@ -44,18 +44,20 @@ def any_lane(e: Emitter, condition: str) -> str:
     return e.emit(f"icmp ne i{e.lanes} {packed}, 0")
 
 
-def power(e: Emitter, x: str, exponent: float) -> str:
-    """x^exponent for positive normal x to five digits: enough to choose a step, the same in all lanes."""
+def log2(e: Emitter, x: str) -> str:
+    """Binary logarithm of positive normal x to five digits: enough to choose a step."""
     whole = e.bits(x)
-    exponent_bits = e.i("sub", e.i("lshr", whole, e.iconst(52)), e.iconst(1023))
+    exponent = e.i("sub", e.i("lshr", whole, e.iconst(52)), e.iconst(1023))
     mantissa = e.i("or", e.i("and", whole, e.iconst(0x000FFFFFFFFFFFFF)), e.iconst(0x3FF0000000000000))
-    m = e.value(mantissa)
-    one = e.const(1.0)
+    m, one = e.value(mantissa), e.const(1.0)
     s = e.f("fdiv", e.f("fsub", m, one), e.f("fadd", m, one))
     series = e.polynomial((1 / 7, 1 / 5, 1 / 3, 1.0), e.f("fmul", s, s))
-    log2 = e.f("fmul", e.f("fmul", s, series), e.const(2.8853900817779268))
-    log2 = e.f("fadd", log2, e.emit(f"sitofp {e.I} {exponent_bits} to {e.V}"))
-    y = e.f("fmul", log2, e.const(exponent))
+    fraction = e.f("fmul", e.f("fmul", s, series), e.const(2.8853900817779268))
+    return e.f("fadd", fraction, e.emit(f"sitofp {e.I} {exponent} to {e.V}"))
+
+
+def exp2(e: Emitter, y: str) -> str:
+    """2^y to five digits."""
     r = e.call("rint", y)
     f = e.f("fmul", e.f("fsub", y, r), e.const(0.6931471805599453))
     fraction = e.polynomial((1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0), f)
@@ -149,9 +151,12 @@ class _Integrator:
         accept = e.emit(f"and {e.B} {active}, {passed}")
         safe = e.select(finite, error, e.const(1.0))
         safe = e.select(e.compare("ogt", safe, e.const(1e-10)), safe, e.const(1e-10))
-        rise = e.f("fmul", power(e, safe, -0.7 / k), power(e, self.get("before"), 0.4 / k))
+        size = log2(e, safe)
+        part = e.f("fmul", size, e.const(-0.7 / k))
+        rise = exp2(e, e.f("fadd", part, e.f("fmul", self.get("before"), e.const(0.4 / k))))
         up = self.limited(e.f("fmul", rise, e.const(SAFETY)), SHRINK, self.get("grow"))
-        down = self.limited(e.f("fmul", power(e, safe, -1.0 / k), e.const(SAFETY)), SHRINK, e.const(SAFETY))
+        fall = exp2(e, e.f("fmul", size, e.const(-1.0 / k)))
+        down = self.limited(e.f("fmul", fall, e.const(SAFETY)), SHRINK, e.const(SAFETY))
         down = e.select(finite, down, e.const(0.1))
         longer, want = e.f("fmul", h, up), self.get("want")
         # a step cut short by the end of a period says little about the next one's length
@@ -159,7 +164,7 @@ class _Integrator:
         kept = e.select(e.compare("ogt", longer, want), longer, want)
         after = e.select(accept, e.select(cut, kept, longer), e.f("fmul", h, down))
         self.set("want", e.select(active, after, want))
-        self.set("before", e.select(accept, safe, self.get("before")))
+        self.set("before", e.select(accept, size, self.get("before")))
         reject = e.emit(f"xor {e.B} {accept}, {active}")
         self.set("grow", e.select(reject, e.const(1.0), e.select(accept, e.const(GROW), self.get("grow"))))
         for name, lanes in (("steps", accept), ("rejected", reject)):
@@ -300,7 +305,7 @@ class _Integrator:
                 e.do(f"store i64 {row}, ptr {e.element(self.row, lane, 'i64')}, align 8")
                 e.do(f"store i64 %first_eval, ptr {e.element(self.index, lane, 'i64')}, align 8")
             self.set("t", splat(e, "%t0"))
-            for name, value in (("before", 1.0), ("grow", GROW), *((s, 0.0) for s in STATISTICS[:4])):
+            for name, value in (("before", 0.0), ("grow", GROW), *((s, 0.0) for s in STATISTICS[:4])):
                 self.set(name, e.const(value))
             with e.loop("%periods") as period:
                 control.hold(period, self.X)

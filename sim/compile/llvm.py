@@ -205,6 +205,13 @@ class Emitter:
             p = self.f("fadd", self.f("fmul", p, z), self.const(c))
         return p
 
+    def pairwise(self, coefficients: Sequence[float], z: str, zz: str) -> str:
+        """Estrin's scheme for six coefficients, highest power first: half the latency of Horner's."""
+        c = [self.const(x) for x in coefficients]
+        top, middle, low = (self.f("fadd", self.f("fmul", c[i], z), c[i + 1]) for i in (0, 2, 4))
+        upper = self.f("fadd", self.f("fmul", top, zz), middle)
+        return self.f("fadd", self.f("fmul", upper, zz), low)
+
     def sincos(self, x: str) -> tuple[str, str]:
         """Sine and cosine, within 1.2e-16 of the reduced argument's."""
         shifted = self.f("fadd", self.f("fmul", x, self.const(0.63661977236758134308)), self.const(_ROUND))
@@ -214,11 +221,12 @@ class Emitter:
         for part in _HALF_PI:
             r = self.f("fsub", r, self.f("fmul", turns, self.const(part)))
         z = self.f("fmul", r, r)
-        sine = self.f("fadd", self.f("fmul", self.f("fmul", r, z), self.polynomial(_SIN, z)), r)
+        zz = self.f("fmul", z, z)
+        sine = self.f("fadd", self.f("fmul", self.f("fmul", r, z), self.pairwise(_SIN, z, zz)), r)
         half = self.f("fmul", z, self.const(0.5))
         head = self.f("fsub", self.const(1.0), half)
         lost = self.f("fsub", self.f("fsub", self.const(1.0), head), half)  # rounding of the head
-        tail = self.f("fadd", self.f("fmul", self.f("fmul", z, z), self.polynomial(_COS, z)), lost)
+        tail = self.f("fadd", self.f("fmul", zz, self.pairwise(_COS, z, zz)), lost)
         cosine = self.f("fadd", head, tail)
         odd = self.i("and", quarter, self.iconst(1))
         swap = self.emit(f"icmp ne {self.I} {odd}, {self.iconst(0)}")
