@@ -31,7 +31,7 @@ FAMILIES = [*ik_cases.REACHABLE, *ik_cases.BEYOND, *ik_cases.LIMITED, *ik_cases.
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("index", range(2))
 def test_verdicts_are_true(family, index):
     case = family(np.random.default_rng([index, 77]))
     solution = solve(case.model, case.goals)
@@ -48,7 +48,9 @@ def test_answers_are_finite_and_within_limits_whatever_is_asked(model, seed):
         if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE and rng.random() < 0.6:
             model.jnt_limited[j] = 1
             half = rng.uniform(0.1, 2.5)
-            model.jnt_range[j] = (0, half) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL else (-half, half)
+            model.jnt_range[j] = (
+                (0, half) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL else (-half, half)
+            )
     site = f"s{rng.integers(model.nsite)}"
     far = 10.0 ** rng.integers(-3, 4)
     goals = [Pose(site, far * rng.normal(size=3), rng.normal(size=4)), Position("s0", rng.normal(size=3))]
@@ -203,15 +205,19 @@ def test_mirror_line_plane_and_sight():
     model = load_model("puppet")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    hand = data.site("right_hand").xpos + [0.15, -0.05, 0.2]
+    hand, seen = data.site("right_hand").xpos + [0.15, -0.05, 0.2], np.array([1.0, -0.3, 0.8])
     goals = [Position("right_hand", hand), Mirror("left_hand", "right_hand"),
-             LookAt("gaze", hand, axis=(1, 0, 0), tolerance=1e-5)]  # fmt: skip
+             LookAt("gaze", seen, axis=(1, 0, 0), tolerance=1e-5)]  # fmt: skip
     joints = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name != "root"]
     solution = solve(model, goals, joints=joints)
     assert solution.solved
     data.qpos[:] = solution.q
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.site("left_hand").xpos, hand * [1, -1, 1], atol=1e-6)
+    sight = seen - data.site("gaze").xpos
+    np.testing.assert_allclose(
+        data.site("gaze").xmat.reshape(3, 3)[:, 0], sight / np.linalg.norm(sight), atol=2e-5
+    )
     np.testing.assert_array_equal(solution.q[:7], model.qpos0[:7])
 
 

@@ -17,7 +17,10 @@ from strategies import random_states, seeds, trees
 
 def _limited(model, rng):
     for j in range(model.njnt):
-        if model.jnt_type[j] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and rng.random() < 0.6:
+        if (
+            model.jnt_type[j] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+            and rng.random() < 0.6
+        ):
             model.jnt_limited[j] = 1
             model.jnt_range[j] = np.sort(rng.normal(size=2) * 1.5)
     return model
@@ -41,7 +44,9 @@ def test_reach_bounds_every_distance_between_frames(model, seed):
     if hops is None:
         return
     bounds = reach(hops)
-    far = np.linalg.norm(kinematics.frame(a).pose(q)[:, :3, 3] - kinematics.frame(b).pose(q)[:, :3, 3], axis=1)
+    far = np.linalg.norm(
+        kinematics.frame(a).pose(q)[:, :3, 3] - kinematics.frame(b).pose(q)[:, :3, 3], axis=1
+    )
     assert (far >= bounds.low - 1e-9).all()
     assert (far <= bounds.high + 1e-9).all()
 

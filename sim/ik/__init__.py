@@ -1,5 +1,13 @@
-"""Inverse kinematics with a verdict."""
+"""Inverse kinematics with a verdict: poses from goals, once, along time, and live.
 
+>>> from pantograph.models import load_model
+>>> from pantograph.sim.ik import Position, solve
+>>> print(solve(load_model("planar_2r"), Position("tip", [2.5, 0, 1])).verdict.kind)
+out of reach
+"""
+
+from .animate import Locked, Pole, Spread, blend, lock, soften
+from .follow import Follower, Tick
 from .goals import (
     CenterOfMass,
     Distance,
@@ -14,26 +22,40 @@ from .goals import (
     Position,
     Posture,
 )
+from .loops import Loops, Projection
 from .raced import ChainSolver
 from .solve import solve
+from .track import Motion, follow
 from .verdict import Residual, Solution, Verdict
 
 __all__ = [
     "CenterOfMass",
     "ChainSolver",
     "Distance",
+    "Follower",
     "Goal",
     "JointValue",
+    "Locked",
     "LookAt",
+    "Loops",
     "Mirror",
+    "Motion",
     "Orientation",
     "PointOnLine",
     "PointOnPlane",
+    "Pole",
     "Pose",
     "Position",
     "Posture",
+    "Projection",
     "Residual",
     "Solution",
+    "Spread",
+    "Tick",
     "Verdict",
+    "blend",
+    "follow",
+    "lock",
+    "soften",
     "solve",
 ]

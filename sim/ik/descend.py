@@ -144,11 +144,12 @@ def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
 
 def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
     """q (nq,) after Gauss-Newton steps of least norm without damping, while these bring judged rows nearer."""
-    x = q[None]
+    x, columns = q[None], np.flatnonzero(problem.moved)
     w = problem.weighted(problem.raw(x))
-    for _ in range(steps):
+    for _ in range(steps if len(columns) else 0):
         J, _ = held_projection(problem, x, np.zeros((1, problem.space.nv)), w.J)
-        d = -np.linalg.lstsq(J[0], w.r[0], rcond=1e-9)[0]
+        d = np.zeros(problem.space.nv)
+        d[columns] = -np.linalg.lstsq(J[0][:, columns], w.r[0], rcond=1e-9)[0]
         trial = problem.space.step(x, d[None])
         w_trial = problem.weighted(problem.raw(trial))
         if not np.abs(w_trial.r).max(initial=0.0) < np.abs(w.r).max(initial=0.0):

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 _HARD = 1e4  # weight of hard goals and loops over wishes of weight 1
 _DAMPING = 1e-8
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
-_SLACK = 1e6
+_SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 3  # linearisations a tick
 
 
@@ -99,29 +99,36 @@ class Follower:
         columns = np.flatnonzero(problem.moved)
         before, low, high = self.q, *self._box()
         d: Array = np.zeros(self.model.nv)
+        allowed = self._allowed()
         for _ in range(_ITERATIONS):
-            d, held = self._programme(problem, columns, d, low, high)
+            d, held = self._programme(problem, columns, d, low, high, allowed)
             self.q = self.space.step(before[None], d[None])[0]
             after = problem.raw(self.q[None]).r
-            if problem.met(after)[0] or (held and self.apart is not None):
+            if problem.met(after)[0] and not allowed:
                 break
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
         met = bool(problem.met(after)[0])
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
 
     def _programme(
-        self, problem: Problem, columns: NDArray[np.intp], d: Array, low: Array, high: Array
+        self,
+        problem: Problem,
+        columns: NDArray[np.intp],
+        d: Array,
+        low: Array,
+        high: Array,
+        allowed: list[float],
     ) -> tuple[Array, tuple[str, ...]]:
         """Step (nv,) better than `d`, by the quadratic programme at q + d, and what holds it."""
         w = problem.weighted(problem.raw(self.q[None]))
         weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
         r, J = w.r[0] * weight, w.J[0][:, columns] * weight[:, None]
-        A, b, names = self._walls(columns)
+        A, b, names = self._walls(columns, allowed)
         n, k = len(columns), len(b)
         H = np.zeros((n + k, n + k))
         H[:n, :n] = J.T @ J + _DAMPING * _HARD * np.eye(n)
         H[n:, n:] = _SLACK * np.eye(k)
-        g = np.concatenate([J.T @ r + _DAMPING * _HARD * d[columns], np.zeros(k)])
+        g = np.concatenate([J.T @ r + _DAMPING * _HARD * d[columns], np.full(k, _PENALTY)])
         eye = np.eye(n + k)
         rows = np.concatenate([eye[:n], -eye[:n], np.concatenate([A, -np.eye(k)], axis=1), -eye[n:]])
         room = np.concatenate([(high - d)[columns], (d - low)[columns], b, np.zeros(k)])
@@ -137,15 +144,22 @@ class Follower:
         x[self.space.scalar_v] = self.q[self.space.scalar_q]
         return step_box(self.space.low - x, self.space.high - x, self.v, self.v_max, self.a_max, self.dt)
 
-    def _walls(self, columns: NDArray[np.intp]) -> tuple[Array, Array, list[str]]:
-        """Rows A d <= b that keep geoms apart, for pairs near enough to matter."""
+    def _allowed(self) -> list[float]:
+        """Least distance of every pair of geoms after this tick (velocity damper)."""
+        if self.apart is None:
+            return []
+        spare = [gap.distance - self.clearance for gap in self.apart.gaps(self.q)]
+        return [self.clearance + (1 - _SHARE) * x for x in spare]
+
+    def _walls(self, columns: NDArray[np.intp], allowed: list[float]) -> tuple[Array, Array, list[str]]:
+        """Rows A d <= b that keep geoms apart, for pairs near enough to matter, at the present q."""
         if self.apart is None:
             return np.zeros((0, len(columns))), np.zeros(0), []
-        gaps = self.apart.gaps(self.q)
-        near = [(gap, name) for gap, name in zip(gaps, self.names, strict=True) if np.any(gap.J)]
-        A = np.array([-gap.J[columns] for gap, _ in near]).reshape(-1, len(columns))
-        b = np.array([_SHARE * (gap.distance - self.clearance) for gap, _ in near])
-        return A, b, [name for _, name in near]
+        every = zip(self.apart.gaps(self.q), allowed, self.names, strict=True)
+        near = [(gap, least, name) for gap, least, name in every if np.any(gap.J)]
+        A = np.array([-gap.J[columns] for gap, _, _ in near]).reshape(-1, len(columns))
+        b = np.array([gap.distance - least for gap, least, _ in near])
+        return A, b, [name for _, _, name in near]
 
     def _held(
         self, columns: NDArray[np.intp], active: NDArray[np.intp], n: int, names: list[str]

@@ -160,13 +160,17 @@ class Loops:
         space = Space(self.model, limits=False)
         x = space.clip(np.array(q, dtype=float)[None])
         fixed = np.zeros(self.model.nv, dtype=bool) if held is None else np.asarray(held, dtype=bool)
-        inverse = np.eye(self.model.nv) if metric is None else np.linalg.inv(np.asarray(metric, dtype=float))
+        free = np.flatnonzero(~fixed)
+        inverse = (
+            np.eye(len(free))
+            if metric is None
+            else np.linalg.inv(np.asarray(metric, dtype=float)[free][:, free])
+        )
         r, J = self.rows(x)
         best, taken = _size(r), 0
         while best > tolerance and taken < steps:
-            A = J[0].copy()
-            A[:, fixed] = 0.0
-            d = _least(A, inverse, -r[0])
+            d = np.zeros(self.model.nv)
+            d[free] = _least(J[0][:, free], inverse, -r[0])
             share = 1.0
             while share > 1e-4:  # a step that opens the loops further is cut
                 trial = space.step(x, share * d[None])

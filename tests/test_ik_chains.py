@@ -1,0 +1,213 @@
+"""Compiled inverse kinematics of chains: right, within limits, repeatable, and the step against NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import ik_cases
+from pantograph.models import ModelError, data_robots, load_model
+from pantograph.sim.ik import ChainSolver
+from pantograph.sim.ik.axes import Axis, linear_trig, three_turns, trig_roots
+from pantograph.sim.ik.raced import moving_part
+from pantograph.sim.ik.step import Chain, step_tape
+from pantograph.sim.kinematics import frame
+from strategies import seeds
+
+
+def _targets(model, site, k, seed=0):
+    low, high = model.jnt_range.T
+    q = np.random.default_rng(seed).uniform(low, high, (k, model.nq))
+    X = frame(model, "site", site).pose(q)
+    return X[:, :3, :3], X[:, :3, 3]
+
+
+def _errors(model, site, q, R, p):
+    X = frame(model, "site", site).pose(q)
+    turn = np.arccos(np.clip(0.5 * (np.einsum("kij,kij->k", X[:, :3, :3], R) - 1), -1, 1))
+    return np.linalg.norm(X[:, :3, 3] - p, axis=1), turn
+
+
+def test_every_pose_of_an_arm_is_found_within_limits():
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    R, p = _targets(model, "tip", 500)
+    raced = arm(R, p)
+    assert raced.met.all()
+    position, rotation = _errors(model, "tip", raced.q, R, p)
+    assert position.max() < 1e-6 * 3**0.5
+    assert rotation.max() < 1e-5  # arccos loses digits near one
+    low, high = model.jnt_range.T
+    assert (raced.q >= low).all() and (raced.q <= high).all()
+
+
+def test_points_and_orientations_alone():
+    model = load_model("arm6")
+    R, p = _targets(model, "tip", 50)
+    raced = ChainSolver(model, "tip", rotation=False)(R, p)
+    assert raced.met.all()
+    assert _errors(model, "tip", raced.q, R, p)[0].max() < 1e-5
+    raced = ChainSolver(model, "tip", position=False)(R, p)
+    assert raced.met.all()
+    assert _errors(model, "tip", raced.q, R, p)[1].max() < 1e-5
+
+
+@settings(max_examples=8, deadline=None)
+@given(seeds, st.integers(1, 7))
+def test_random_chains_with_slides(seed, n):
+    rng = np.random.default_rng(seed)
+    kinds = [ik_cases.SLIDE if rng.random() < 0.25 else ik_cases.HINGE for _ in range(n)]
+    links = [
+        (0.3 * rng.normal(size=3), kind, ik_cases.unit(rng), np.sort(rng.uniform(-2.5, 2.5, 2)))
+        for kind in kinds
+    ]
+    model = ik_cases.chain([*links, (0.2 * rng.normal(size=3), None, None, None)])
+    R, p = _targets(model, "tip", 20, seed)
+    raced = ChainSolver(model, "tip")(R, p)
+    low, high = model.jnt_range.T
+    assert np.isfinite(raced.q).all()
+    assert (raced.q >= low).all() and (raced.q <= high).all()
+    assert raced.met.mean() > 0.9
+    assert max(_errors(model, "tip", raced.q[raced.met], R[raced.met], p[raced.met])[0], default=0) < 1e-5
+
+
+@pytest.mark.parametrize("far", [1e1, 1e6, 1e150])
+def test_unreachable_and_absurd_targets_end_without_harm(far):
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    raced = arm(np.eye(3), [far, 0, 0], most=200)
+    assert not raced.met[0]
+    assert raced.iterations[0] == 200
+    assert ik_cases.illegal(model, raced.q[0]) == []
+
+
+def test_one_call_and_a_batch_agree_and_repeat():
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    R, p = _targets(model, "tip", 20)
+    batch = arm(R, p)
+    for i in range(20):
+        np.testing.assert_array_equal(arm(R[i], p[i]).q[0], batch.q[i])
+
+
+def test_the_seed_is_tried_first():
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    q = np.array([0.4, 0.3, -0.7, 0.5, 0.8, -0.3])
+    X = frame(model, "site", "tip").pose(q)
+    raced = arm(X[:3, :3], X[:3, 3], seed=q + 1e-3)
+    np.testing.assert_allclose(raced.q[0], q, atol=1e-5)
+
+
+def test_a_step_is_the_damped_least_squares_step():
+    """Against NumPy's solution of the same normal equations, away from limits, for a redundant and a short chain."""
+    for lengths in ((0.5, 0.4, 0.3, 0.2), (0.5,) * 7):
+        rng = np.random.default_rng(len(lengths))
+        links = [([0, 0, x], ik_cases.HINGE, ik_cases.unit(rng), (-3, 3)) for x in lengths]
+        model = ik_cases.chain([*links, ([0.1, 0.2, 0.3], None, None, None)])
+        f = frame(model, "site", "tip")
+        scale = 0.7
+        tape = step_tape(Chain(f, model.jnt_range, True, True, scale))
+        q, target = rng.uniform(-1, 1, (2, model.nq))
+        q_near = q + 0.1 * (target - q)
+        X_T = f.pose(q_near)
+        t = np.concatenate([X_T[:3, :3].ravel(), X_T[:3, 3], [1e-5, 1e-5]])
+        out, error = tape.evaluate(q, t)
+        X, J = f.pose(q), f.jacobian(q)
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_matrix(X[:3, :3] @ X_T[:3, :3].T).as_rotvec()
+        angle = np.linalg.norm(turn)
+        e = np.concatenate([(X[:3, 3] - X_T[:3, 3]) / scale, turn / angle * 2 * np.sin(angle / 2)])
+        A = np.vstack([J[3:] / scale, J[:3]])
+        damping = 0.03 * e @ e + 1e-11
+        d = -np.linalg.solve(A.T @ A + damping * np.eye(model.nv), A.T @ e)
+        d *= min(1.0, 0.8 / np.abs(d).max())
+        np.testing.assert_allclose(out - q, d, rtol=1e-6, atol=1e-9)
+        assert error[0] == pytest.approx(
+            np.abs(np.concatenate([e[:3] * scale, e[3:]])).max() / 1e-5, rel=1e-9
+        )
+
+
+def test_joints_that_stand_are_folded_into_the_chain():
+    model = load_model("puppet")
+    f = frame(model, "site", "left_hand")
+    moved = np.zeros(model.nv, dtype=bool)
+    arm = [model.joint(n).dofadr[0] for n in ("left_shoulder_pitch", "left_shoulder_roll", "left_elbow")]
+    moved[arm] = True
+    rng = np.random.default_rng(0)
+    start = model.qpos0.copy()
+    start[:3] = rng.normal(size=3)
+    start[3:7] = ik_cases.unit(rng)[0], 0.5, 0.2, 0.1
+    part = moving_part(f, moved, start)
+    q = start.copy()
+    q[[model.joint(n).qposadr[0] for n in ("left_shoulder_pitch", "left_shoulder_roll", "left_elbow")]] += 0.3
+    np.testing.assert_allclose(part.pose(q), f.pose(q), atol=1e-12)
+    assert len(part.joints) == 3
+
+
+def test_chains_of_other_joints_are_refused():
+    with pytest.raises(ModelError, match="hinges and slides"):
+        ChainSolver(load_model("puppet"), "left_hand")
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds)
+def test_trigonometric_roots_are_roots_and_all(seed):
+    rng = np.random.default_rng(seed)
+    c = rng.normal(size=5) * (rng.random(5) < 0.8)
+
+    def f(x):
+        return c[0] + c[1] * np.cos(x) + c[2] * np.sin(x) + c[3] * np.cos(2 * x) + c[4] * np.sin(2 * x)
+
+    roots = trig_roots(f(2 * np.pi * np.arange(5) / 5))
+    size = np.abs(c).max() + 1e-9
+    grid = np.linspace(-np.pi, np.pi, 20_001)
+    crossings = np.flatnonzero(np.diff(np.sign(f(grid))) != 0)
+    if roots.complete:
+        assert all(abs(f(x)) < 1e-7 * size for x in roots.angles)
+        for i in crossings:
+            turns = np.angle(np.exp(1j * (np.array(roots.angles) - grid[i])))
+            assert np.abs(turns).min() < 1e-3
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds)
+def test_three_turns_compose_to_the_rotation(seed):
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(seed)
+    axes = [Axis(np.zeros(3), ik_cases.unit(rng)) for _ in range(3)]
+    angles = rng.uniform(-np.pi, np.pi, 3)
+
+    def product(angles):
+        out = Rotation.identity()
+        for axis, angle in zip(axes, angles, strict=True):
+            out = out * Rotation.from_rotvec(angle * axis.u)
+        return out.as_matrix()
+
+    found = three_turns(axes, product(angles))
+    assert found.angles
+    for each in found.angles:
+        np.testing.assert_allclose(product(each), product(angles), atol=1e-6)
+
+
+def test_linear_trigonometric_equation():
+    roots = linear_trig(3.0, 4.0, 2.0)
+    assert roots.complete and len(roots.angles) == 2
+    for x in roots.angles:
+        assert 3 * np.cos(x) + 4 * np.sin(x) == pytest.approx(2.0)
+    assert linear_trig(3.0, 4.0, 5.1) == ([], True)
+
+
+@pytest.mark.skipif("wx250s" not in data_robots(), reason="the data folder with wx250s is absent")
+def test_a_real_arm_from_its_own_file():
+    model = load_model("wx250s")
+    arm = ChainSolver(model, "body:wx250s/gripper_link")
+    rng = np.random.default_rng(0)
+    q = np.tile(model.qpos0, (200, 1))
+    q[:, arm.columns] = rng.uniform(*arm.chain.limits.T, (200, 6))
+    X = frame(model, "body", "wx250s/gripper_link").pose(q)
+    raced = arm(X[:, :3, :3], X[:, :3, 3])
+    assert raced.met.all()
+    q[:, arm.columns] = raced.q
+    np.testing.assert_allclose(frame(model, "body", "wx250s/gripper_link").pose(q), X, atol=3e-6)

@@ -1,0 +1,312 @@
+"""Inverse kinematics along time: limits, singularities, deviations told, clearance, and animators' constraints."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import ik_cases
+from pantograph.models import ModelError, load_model
+from pantograph.sim.ik import Follower, JointValue, Pole, Pose, Position, blend, follow, lock, soften, solve
+from pantograph.sim.ik.band import _Banded, _interior
+from pantograph.sim.ik.qp import minimise
+from pantograph.sim.kinematics import frame
+from strategies import seeds
+
+
+def _wrist_arm(limits=2.9):
+    """Six hinges with a spherical wrist that is singular at zero."""
+    axes = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
+    offsets = [[0, 0, 0], [0, 0, 0.3], [0, 0, 0.4], [0, 0, 0.35], [0, 0, 0], [0, 0, 0]]
+    links = [(o, ik_cases.HINGE, a, (-limits, limits)) for o, a in zip(offsets, axes, strict=True)]
+    return ik_cases.chain([*links, ([0, 0, 0.1], None, None, None)])
+
+
+def _eight(model, *, period=4.0):
+    """A figure-eight of the tip whose middle has the wrist exactly singular, orientation kept."""
+    q = np.array([0.2, 0.7, 1.1, 0.3, 0.0, 0.0])
+    p, quat = ik_cases.pose_of(model, q, "tip")
+
+    def goals(t):
+        w = 2 * np.pi * t / period
+        return [Pose("tip", p + [0.02 * np.sin(2 * w), 0.06 * np.sin(w), 0.0], quat)]
+
+    return q, goals
+
+
+def test_a_figure_eight_through_a_wrist_singularity_streams_within_limits_and_tells_its_deviation():
+    model = _wrist_arm()
+    q, goals = _eight(model)
+    dt, v_max, a_max = 0.02, 2.0, 30.0
+    follower = Follower(model, dt=dt, q0=q, velocity=v_max, acceleration=a_max)
+    before, worst, told = np.zeros(model.nv), 0.0, 0.0
+    f = frame(model, "site", "tip")
+    for k in range(200):
+        tick = follower.step(goals(k * dt))
+        assert np.abs(tick.v).max() <= v_max * (1 + 1e-9)
+        assert np.abs(tick.v - before).max() <= a_max * dt * (1 + 1e-6)
+        assert ik_cases.illegal(model, tick.q) == []
+        true = np.linalg.norm(f.pose(tick.q)[:3, 3] - goals(k * dt)[0].position)
+        assert tick.residuals[0].position == pytest.approx(true, abs=1e-12)
+        assert tick.followed == tick.residuals[0].met
+        assert tick.followed or tick.held
+        before, worst, told = tick.v, max(worst, true), max(told, tick.residuals[0].position)
+    assert worst < 0.03
+
+
+def test_a_whole_figure_eight_is_smooth_and_follows_better_than_streaming():
+    model = _wrist_arm()
+    q, goals = _eight(model)
+    times = np.arange(0, 4, 0.04)
+    motion = follow(model, goals, times, q0=q, velocity=2.0, acceleration=30.0)
+    assert motion.speed <= 1.0 and motion.effort <= 1.0
+    steps = np.diff(motion.q, axis=0) / 0.04
+    assert np.abs(steps).max() <= 2.0
+    assert np.abs(np.diff(steps, axis=0)).max() / 0.04 <= 30.0
+    f = frame(model, "site", "tip")
+    true = [
+        np.linalg.norm(f.pose(x)[:3, 3] - goals(t)[0].position) for t, x in zip(times, motion.q, strict=True)
+    ]
+    np.testing.assert_allclose(motion.position, true, atol=1e-12)
+    follower = Follower(model, dt=0.04, q0=motion.q[0], velocity=2.0, acceleration=30.0)
+    streamed = [follower.step(goals(t)).residuals[0].position for t in times]
+    assert motion.position.max() <= max(streamed) + 1e-6
+    clip = motion.clip()
+    np.testing.assert_allclose(clip.evaluate(times).q, motion.q, atol=1e-9)
+
+
+def test_an_easy_path_is_followed_exactly():
+    model = load_model("arm6")
+    q = np.array([0.3, 0.4, 0.5, 0.1, 0.6, 0.2])
+    p, quat = ik_cases.pose_of(model, q, "tip")
+    times = np.arange(0, 2, 0.05)
+    motion = follow(model, lambda t: [Pose("tip", p + [0, 0.05 * np.sin(3 * t), 0], quat)], times, q0=q)
+    assert motion.followed and motion.missed == ()
+    assert motion.position.max() < 1e-6 and motion.rotation.max() < 1e-6
+
+
+def test_what_cannot_be_followed_is_told_with_its_reason():
+    model = ik_cases.planar_chain((1.0, 0.8))
+    times = np.arange(0, 2, 0.05)
+    out = follow(
+        model, lambda t: [Position("tip", [1.5 + 0.5 * np.sin(np.pi * t), 0.2, 0])], times, q0=[-0.3, 0.8]
+    )
+    assert len(out.missed) == 1
+    assert out.missed[0].verdict.kind == "out of reach"
+    assert out.missed[0].verdict.proved
+    far = np.hypot(1.5 + 0.5 * np.sin(np.pi * times), 0.2)
+    assert out.missed[0].position == pytest.approx((far - 1.8).max(), abs=2e-3)
+    fast = follow(
+        model, lambda t: [Position("tip", [1.4 * np.cos(4 * t), 1.4 * np.sin(4 * t), 0])], times, velocity=1.0
+    )
+    assert fast.missed and fast.missed[0].verdict is None
+    assert fast.speed <= 1.0
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_streaming_never_breaks_a_limit_whatever_is_asked(seed):
+    rng = np.random.default_rng(seed)
+    model = ik_cases._random_chain(rng, 5)
+    dt, v_max, a_max = 0.02, rng.uniform(0.2, 4), rng.uniform(1, 60)
+    follower = Follower(model, dt=dt, q0=ik_cases._within(model, rng), velocity=v_max, acceleration=a_max)
+    before = np.zeros(model.nv)
+    for k in range(25):
+        if k % 8 == 0:
+            goal = Pose("tip", 3 * rng.normal(size=3), rng.normal(size=4))
+        tick = follower.step([goal])
+        assert ik_cases.illegal(model, tick.q) == []
+        assert np.abs(tick.v).max() <= v_max * (1 + 1e-9)
+        assert np.abs(tick.v - before).max() <= a_max * dt * (1 + 1e-6)
+        before = tick.v
+
+
+def test_streaming_keeps_named_geoms_apart():
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    body = spec.worldbody
+    for i in range(3):
+        body = body.add_body(name=f"b{i}", pos=[0 if i == 0 else 0.5, 0, 0])
+        body.add_joint(name=f"j{i}", type=ik_cases.HINGE, axis=[0, 0, 1])
+        body.add_geom(
+            name=f"g{i}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0.5, 0, 0], size=[0.04, 0, 0]
+        )
+    body.add_site(name="tip", pos=[0.5, 0, 0])
+    spec.worldbody.add_geom(
+        name="post", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.1, 0.5, 0], pos=[0.9, 0.35, 0]
+    )
+    model, clearance = spec.compile(), 0.02
+    start, pairs = np.array([-0.3, 0.2, 0.2]), [(f"g{i}", "post") for i in range(3)]
+    data = mujoco.MjData(model)
+
+    def nearest(apart):
+        follower = Follower(model, dt=0.02, q0=start, velocity=2.0, apart=apart, clearance=clearance)
+        least, held = np.inf, set()
+        for k in range(120):
+            angle = -0.1 + 0.9 * min(1.0, k / 80)
+            tick = follower.step([Position("tip", [1.2 * np.cos(angle), 1.2 * np.sin(angle), 0])])
+            data.qpos[:] = tick.q
+            mujoco.mj_forward(model, data)
+            ends = np.zeros(6)
+            least = min(least, *(mujoco.mj_geomDistance(model, data, i + 1, 0, 1.0, ends) for i in range(3)))
+            held |= set(tick.held)
+        return least, held
+
+    assert nearest(())[0] < 0
+    least, held = nearest(pairs)
+    assert least >= clearance - 1e-4
+    assert any("near post" in what for what in held)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.integers(1, 8), st.integers(0, 14))
+def test_small_quadratic_programmes_meet_their_optimality_conditions(seed, n, k):
+    rng = np.random.default_rng(seed)
+    M = rng.normal(size=(n, n))
+    H, g = M @ M.T + 0.1 * np.eye(n), rng.normal(size=n)
+    A, inside = rng.normal(size=(k, n)), rng.normal(size=n)
+    b = A @ inside + rng.uniform(0, 1, k) * (rng.random(k) < 0.7)
+    found = minimise(H, g, A, b)
+    assert found.feasible
+    assert (A @ found.x <= b + 1e-8).all()
+    active = A[list(found.active)]
+    multipliers = np.linalg.lstsq(active.T, -(H @ found.x + g), rcond=None)[0] if len(active) else np.zeros(0)
+    np.testing.assert_allclose(H @ found.x + g + active.T @ multipliers, 0, atol=1e-6)
+    assert (multipliers >= -1e-6).all()
+
+
+def test_a_quadratic_programme_that_cannot_be_met_says_so():
+    found = minimise(np.eye(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
+    assert not found.feasible
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_banded_programmes_agree_with_an_independent_solver(seed):
+    from scipy.optimize import minimize
+
+    rng = np.random.default_rng(seed)
+    k, n = 12, 2
+    H = _Banded(k, n)
+    for i in range(k):
+        B = rng.normal(size=(3, n))
+        H.add_block(i, 10 * B.T @ B + 0.1 * np.eye(n))
+    H.add_differences((1.0, -2.0, 1.0), np.ones((k - 2, n)))
+    dense = np.diag(H.bands[0])
+    for d in range(1, 2 * n + 1):
+        dense += np.diag(H.bands[d, :-d], d) + np.diag(H.bands[d, :-d], -d)
+    g = 20 * rng.normal(size=(k, n))
+    sets = [((1.0,), np.full((k, n), -0.5), np.full((k, n), 0.5), np.full(n, 0.5)),
+            ((-1.0, 1.0), np.full((k - 1, n), -0.1), np.full((k - 1, n), 0.1), np.full(n, 0.1)),
+            ((1.0, -2.0, 1.0), np.full((k - 2, n), -0.05), np.full((k - 2, n), 0.05), np.full(n, 0.05))]  # fmt: skip
+    x = _interior(H, g, sets)
+
+    def walls(y):
+        y = y.reshape(k, n)
+        return np.concatenate([(0.5 - np.abs(y)).ravel(), (0.1 - np.abs(np.diff(y, axis=0))).ravel(),
+                               (0.05 - np.abs(np.diff(y, 2, axis=0))).ravel()])  # fmt: skip
+
+    def cost(y):
+        return 0.5 * y @ dense @ y + g.ravel() @ y
+
+    assert walls(x.ravel()).min() > -1e-8
+    found = minimize(cost, np.zeros(k * n), constraints={"type": "ineq", "fun": walls}, method="SLSQP",
+                     options={"maxiter": 1000, "ftol": 1e-12})  # fmt: skip
+    assert cost(x.ravel()) <= found.fun + 1e-3 * abs(found.fun)
+
+
+def _walk(model, times):
+    """A puppet that drifts forward while its legs swing: feet slide unless they are locked."""
+    q = np.tile(model.qpos0, (len(times), 1))
+    w = 2 * np.pi * times
+    q[:, 0] += 0.1 * times
+    q[:, 2] -= 0.02 + 0.01 * np.sin(w)
+    for side, phase in (("left", 0.0), ("right", np.pi)):
+        for joint, wave in (
+            ("hip_pitch", 0.25 * np.sin(w + phase)),
+            ("knee", 0.3 + 0.25 * np.sin(w + phase + 1)),
+        ):
+            q[:, model.joint(f"{side}_{joint}").qposadr[0]] += wave
+    return q
+
+
+def test_a_locked_foot_does_not_slide():
+    model, times = load_model("puppet"), np.arange(0, 1.5, 1 / 30)
+    q = _walk(model, times)
+    stances = {"left_foot": [(0.2, 0.5)], "right_foot": [(0.7, 1.0)]}
+    locked = lock(model, times, q, stances)
+    for foot, ((start, end),) in stances.items():
+        on = (times >= start) & (times <= end)
+        places = frame(model, "site", foot).pose(locked.q)[on, :3, 3]
+        assert np.abs(places - places[0]).max() < 1e-4
+        loose = frame(model, "site", foot).pose(q)[on, :3, 3]
+        assert np.abs(loose - loose[0]).max() > 1e-3
+    away = (times < 0.05) | (times > 1.15)
+    np.testing.assert_allclose(locked.q[away], q[away], atol=1e-9)
+    assert all(ik_cases.illegal(model, x) == [] for x in locked.q)
+    assert np.abs(np.diff(locked.q, axis=0)).max() < 0.35
+
+
+def test_a_place_out_of_a_legs_reach_is_told():
+    model, times = load_model("puppet"), np.arange(0, 1, 1 / 10)
+    q = np.tile(model.qpos0, (len(times), 1))
+    q[:, 0] += np.linspace(-1, 1, len(times))
+    locked = lock(model, times, q, {"left_foot": [(0.0, 0.9)]})
+    assert not locked.met[0] and locked.slip[0] > 0.1
+    f = frame(model, "site", "left_foot").pose(locked.q)[:, :3, 3]
+    middle = np.argmin(np.abs(times - 0.45))
+    assert locked.slip[0] == pytest.approx(np.linalg.norm(f[0] - f[middle]), abs=1e-6)
+
+
+def test_the_pole_says_where_the_elbow_points():
+    a, b = 0.4, 0.3
+    links = [([0, 0, 0], ik_cases.BALL, (0, 0, 1), None), ([a, 0, 0], ik_cases.HINGE, (0, 0, 1), (0, 2.8))]
+    model = ik_cases.chain([*links, ([b, 0, 0], None, None, None)])
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        hand, pole = 0.5 * ik_cases.unit(rng), 2 * rng.normal(size=3)
+        solution = solve(model, [Position("tip", hand), Pole("body:link_0", "at1", "tip", pole, weight=1.0)])
+        assert solution.solved
+        elbow = ik_cases.pose_of(model, solution.q, "at1")[0]
+        along = hand / np.linalg.norm(hand)
+        side, wanted = elbow - (elbow @ along) * along, pole - (pole @ along) * along
+        assert side @ wanted / np.linalg.norm(side) / np.linalg.norm(wanted) > 1 - 1e-6
+
+
+@given(st.floats(0, 5), st.floats(0.05, 0.9))
+def test_soft_reach_never_reaches_and_never_turns_back(far, softness):
+    near = np.linalg.norm(soften([0, 0, 0], [far, 0, 0], 1.0, softness))
+    further = np.linalg.norm(soften([0, 0, 0], [far + 1e-3, 0, 0], 1.0, softness))
+    assert near <= 1.0 and near <= far + 1e-12
+    assert near <= further <= near + 1e-3 + 1e-12
+    if far <= 1 - softness:
+        assert near == pytest.approx(far)
+
+
+def test_blending_goes_from_keys_to_goals_along_the_shortest_way():
+    model = load_model("puppet")
+    rng = np.random.default_rng(0)
+    from pantograph.sim.ik.space import Space
+
+    space = Space(model)
+    fk, ik = (space.random(rng, 4, model.qpos0, np.ones(model.nv, dtype=bool)) for _ in range(2))
+    np.testing.assert_allclose(blend(model, fk, ik, 0.0), fk, atol=1e-12)
+    ends = blend(model, fk, ik, 1.0)
+    np.testing.assert_allclose(space.difference(ends, ik), 0, atol=1e-9)
+    half = blend(model, fk, ik, 0.5)
+    np.testing.assert_allclose(space.difference(ik, half), space.difference(half, fk), atol=1e-9)
+    assert all(ik_cases.illegal(model, x) == [] for x in half)
+    arm = blend(model, fk, ik, 1.0, joints=["left_elbow"])
+    moved = np.flatnonzero(np.abs(arm - fk).max(axis=0) > 1e-12)
+    assert moved.tolist() == [model.joint("left_elbow").qposadr[0]]
+
+
+def test_mistakes_are_told():
+    model = load_model("arm6")
+    with pytest.raises(ModelError, match="evenly spaced"):
+        follow(model, lambda t: [JointValue("elbow", 0)], [0, 1, 3])
+    with pytest.raises(ModelError, match="velocity must be positive"):
+        Follower(model, dt=0.01, velocity=-1)
+    with pytest.raises(ModelError, match="end after it starts"):
+        lock(model, [0, 1], np.zeros((2, 6)), {"tip": [(1, 0)]})
+    with pytest.raises(ModelError, match="below the reach"):
+        soften([0, 0, 0], [1, 0, 0], 1.0, 2.0)
