@@ -20,6 +20,7 @@ Rows = list[tuple[float, ...]]
 
 PATIENCE = 5  # cycles without an answer, or with an old goal, after which a servo is lost
 LAGGING = 10  # cycles behind its goal after which a servo is obstructed
+_LATE = 0.5  # periods that a cycle may begin late; beyond that it is skipped
 HEALTH_PERIOD = 1.0  # s between looks at voltage and temperature
 _STEP_MARGIN = 1.25  # of the greatest step of a goal over velocity limit x time
 _HOT = 2.0  # K below the temperature limit at which the rig stops, before the servo lets go by itself
@@ -87,24 +88,8 @@ class Loop:
     ) -> None:
         """Stream target(t) (ns,) [rad] for t from 0 to `duration` [s]; a target of None ends it.
 
-        Cycle k is due at start + k * period whatever happened before: late ones are skipped, never made up
-        for."""
-        clock, period = self.driver.clock, self.period
-        start, k = clock.now(), 0
-        last = ceil(duration / period - 1e-9) if np.isfinite(duration) else None
-        while last is None or k <= last:
-            due = start + k * period
-            clock.sleep_until(due)
-            goal = target(min(k * period, duration))
-            if goal is None:
-                return
-            self.cycle(goal, due, phase)
-            late = (clock.now() - start) / period
-            following = max(k + 1, ceil(late - 1e-9))
-            self.log.skipped += following - k - 1
-            k = following
-
-    def cycle(self, goal: Array, due: float, phase: Phase) -> None:
+        Cycle k is due at start + k * period whatever happened before: one that could begin only later than half
+        a period is skipped, never made up for.
         """Write one goal to all servos, read all of them, look for faults."""
         driver, log = self.driver, self.log
         begun = driver.clock.now()
