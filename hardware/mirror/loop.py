@@ -88,8 +88,25 @@ class Loop:
     ) -> None:
         """Stream target(t) (ns,) [rad] for t from 0 to `duration` [s]; a target of None ends it.
 
-        Cycle k is due at start + k * period whatever happened before: one that could begin only later than half
-        a period is skipped, never made up for.
+        Cycle k is due at start + k * period whatever happened before: one that could only begin later than
+        half a period is skipped, never made up for.
+        """
+        clock, period = self.driver.clock, self.period
+        start, k = clock.now(), 0
+        last = ceil(duration / period - 1e-9) if np.isfinite(duration) else None
+        while last is None or k <= last:
+            due = start + k * period
+            clock.sleep_until(due)
+            goal = target(min(k * period, duration))
+            if goal is None:
+                return
+            self.cycle(goal, due, phase)
+            late = (clock.now() - start) / period
+            following = max(k + 1, ceil(late - _LATE))
+            self.log.skipped += following - k - 1
+            k = following
+
+    def cycle(self, goal: Array, due: float, phase: Phase) -> None:
         """Write one goal to all servos, read all of them, look for faults."""
         driver, log = self.driver, self.log
         begun = driver.clock.now()
