@@ -311,7 +311,7 @@ def fastest_rate(setup: Setup) -> float:
             stiffness[dof] += max(0.0, -m.actuator_biasprm[i, 1]) * gear**2
             damping[dof] += max(0.0, -m.actuator_biasprm[i, 2]) * gear**2
     moving = setup.roles[m.dof_jntid] != Role.KEYED
-    rates = np.maximum(np.sqrt(stiffness * mobility), damping * mobility)
+    rates = np.maximum(np.sqrt(np.maximum(stiffness * mobility, 0.0)), damping * mobility)
     return float(np.max(rates[moving], initial=0.0))
 
 
