@@ -7,7 +7,7 @@ out of reach
 """
 
 from .animate import Locked, Pole, Spread, blend, lock, soften
-from .follow import Follower, Tick
+from .stream import Follower, Tick
 from .goals import (
     CenterOfMass,
     Distance,

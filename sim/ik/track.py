@@ -24,7 +24,7 @@ from ..errors import ModelError
 from ..kinds import BALL, FREE
 from ..rotation_curves import keyed_rotation
 from .band import Limits, smoothest_step
-from .follow import Follower, frozen, limit
+from .stream import Follower, frozen, limit
 from .goals import Goal
 from .pose import Kinematics
 from .problem import Problem

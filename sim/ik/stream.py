@@ -30,10 +30,11 @@ from .verdict import Residual
 
 Array = NDArray[np.float64]
 _HARD = 1e4  # weight of hard goals and loops over wishes of weight 1
-_DAMPING = 1e-8
+_LEAST = 1e-8  # damping; it grows where steps do not help, before goals that cannot be met
+_CLOSE = 1e-20
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
-_ITERATIONS = 3  # linearisations a tick
+_ITERATIONS = 4  # linearisations a tick
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class Follower:
         self.space, self.kinematics = Space(model), Kinematics(model)
         self.q = self.space.check(model.qpos0 if q0 is None else q0)
         self.v: Array = np.zeros(model.nv)
+        self._damping = _LEAST
         self.v_max, self.a_max = (
             limit("velocity", velocity, model.nv),
             limit("acceleration", acceleration, model.nv),
@@ -100,15 +102,37 @@ class Follower:
         before, low, high = self.q, *self._box()
         d: Array = np.zeros(self.model.nv)
         allowed = self._allowed()
+        d = np.clip(d, low, high)
+        self.q = self.space.step(before[None], d[None])[0]
+        best, held = self._cost(problem, self.q, allowed), tuple[str, ...]()
         for _ in range(_ITERATIONS):
-            d, held = self._programme(problem, columns, d, low, high, allowed)
-            self.q = self.space.step(before[None], d[None])[0]
-            after = problem.raw(self.q[None]).r
-            if problem.met(after)[0] and not allowed:
-                break
+            trial, why = self._programme(problem, columns, d, low, high, allowed)
+            q = self.space.step(before[None], trial[None])[0]
+            cost = self._cost(problem, q, allowed)
+            better = cost < best
+            self._damping = min(max(self._damping * (0.03 if better else 30.0), _LEAST), 1.0)
+            held = why if better or not held else held
+            if better:
+                self.q, d, best = q, trial, cost
+                if cost < _CLOSE:
+                    break
+            else:
+                self.q = self.space.step(before[None], d[None])[0]
+        after = problem.raw(self.q[None]).r
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
         met = bool(problem.met(after)[0])
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
+
+    def _cost(self, problem: Problem, q: Array, allowed: list[float]) -> float:
+        """Squared residuals at q (nq,), walls that are passed counted most."""
+        w = problem.weighted(problem.raw(q[None])).r[0]
+        passed = 0.0
+        if self.apart is not None:
+            gaps = self.apart.gaps(q)
+            passed = max(
+                (least - gap.distance for gap, least in zip(gaps, allowed, strict=True)), default=0.0
+            )
+        return float(w @ (w * np.where(problem.judged, 1.0, 1.0 / _HARD))) + 1e3 * max(0.0, passed)
 
     def _programme(
         self,
@@ -126,9 +150,10 @@ class Follower:
         A, b, names = self._walls(columns, allowed)
         n, k = len(columns), len(b)
         H = np.zeros((n + k, n + k))
-        H[:n, :n] = J.T @ J + _DAMPING * _HARD * np.eye(n)
+        damping = self._damping * _HARD
+        H[:n, :n] = J.T @ J + damping * np.eye(n)
         H[n:, n:] = _SLACK * np.eye(k)
-        g = np.concatenate([J.T @ r + _DAMPING * _HARD * d[columns], np.full(k, _PENALTY)])
+        g = np.concatenate([J.T @ r, np.full(k, _PENALTY)])
         eye = np.eye(n + k)
         rows = np.concatenate([eye[:n], -eye[:n], np.concatenate([A, -np.eye(k)], axis=1), -eye[n:]])
         room = np.concatenate([(high - d)[columns], (d - low)[columns], b, np.zeros(k)])
