@@ -5,6 +5,7 @@ from ..models.errors import ModelError, PantographError, unknown
 __all__ = [
     "EngineError",
     "FilmError",
+    "FilmWarning",
     "KeyingError",
     "ModelError",
     "PantographError",
@@ -28,6 +29,10 @@ class EngineError(PantographError):
 
 class RecordingError(PantographError):
     """A recording file is torn, foreign or of an unknown version."""
+
+
+class FilmWarning(UserWarning):
+    """A film leaves something of the model out."""
 
 
 class FilmError(PantographError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +16,7 @@ from rich.table import Table
 
 from ...models import load_model, names_of
 from ..engines.interface import Drive, Role
+from ..errors import FilmWarning
 from ..plan import Plan
 from ..recording import Recording
 
@@ -80,6 +82,16 @@ def error_text(recording: Recording) -> str:
             "after it the error is an indication only"
         )
     return text
+
+
+@contextmanager
+def film_notes(console: Console) -> Iterator[None]:
+    """Print what a film leaves out as notes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", FilmWarning)
+        yield
+    for warning in caught:
+        console.print(f"[yellow]note:[/] {escape(str(warning.message))}", soft_wrap=True)
 
 
 def notes(console: Console, recording: Recording) -> None:

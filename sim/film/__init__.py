@@ -1,6 +1,7 @@
 """Films and pictures of a motion, drawn without a window."""
 
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FilmError
+from ..errors import FilmError, FilmWarning
 from .cameras import Camera
 from .lights import Light, default_lights
 from .renderer import Renderer
@@ -37,6 +38,7 @@ def film(
     What `path` may be: see `write`. Without a `camera`, one that frames the whole motion; without `lights`,
     the model file's or, when it has none, three of our own. Frames fall at t[0] + k / fps; between samples
     the motion is interpolated on the manifold (shortest rotations). `size` is (width, height) in pixels.
+    A FilmWarning names what of the model is not drawn.
 
     Raises FilmError for times that do not rise, wrong shapes, values that are not finite, or a missing
     OpenGL library.
@@ -47,6 +49,7 @@ def film(
     shot = times[0] + np.arange(int((times[-1] - times[0]) * fps + 1e-9) + 1) / fps
     view = (camera or Camera.auto(model, motion, aspect=size[0] / size[1])).follow(model, times, motion)
     with Renderer(model, width=size[0], height=size[1], lights=lights, shadows=shadows) as renderer:
+        _tell(renderer.not_drawn)
         frames = (
             renderer.render(q_k, t_k, camera=view) for t_k, q_k in resampled(model, times, motion, shot)
         )
@@ -68,7 +71,13 @@ def still(
     _, motion = _checked(model, [t], np.atleast_2d(np.asarray(q, dtype=float)))
     view = camera or Camera.auto(model, motion, aspect=size[0] / size[1])
     with Renderer(model, width=size[0], height=size[1], lights=lights, shadows=shadows) as renderer:
+        _tell(renderer.not_drawn)
         return write(path, [renderer.render(motion[0], t, camera=view)], fps=1.0, progress=False)
+
+
+def _tell(not_drawn: Sequence[str]) -> None:
+    if not_drawn:
+        warnings.warn("not drawn: " + "; ".join(not_drawn), FilmWarning, stacklevel=3)
 
 
 def resampled(model: mujoco.MjModel, t: Floats, q: Floats, times: Floats) -> Iterator[tuple[float, Floats]]:
