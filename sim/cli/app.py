@@ -65,6 +65,9 @@ def run(
     ] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Mirror: slow the motion down until it fits.")] = False,
     stop: Annotated[str, typer.Option(help="Mirror: how the rig is left: hold, park or limp.")] = "hold",
+    take_over: Annotated[
+        bool, typer.Option("--take-over", help="Mirror: accept servos whose torque is on already.")
+    ] = False,
 ) -> None:
     """Run a scene; its recording is always saved."""
     from ..plan import make_plan
@@ -82,7 +85,8 @@ def run(
         _draw(recording, film, plot, out)
     _finish(recording)
     if mirror is not None:
-        _mirror(recording, mirror, port, slow, stop, out / f"{scene.stem}-rig.npz")
+        options = {"port": port, "slow": slow, "stop": stop, "take_over": take_over}
+        _mirror(recording, mirror, out / f"{scene.stem}-rig.npz", options)
 
 
 @app.command(epilog="Example: pantograph plan wave.toml")
@@ -108,7 +112,9 @@ def film(
     from ..recording import load
     from ..shoot import shoot
 
-    written = shoot(load(recording), path, camera=camera, fps=fps, size=_size(size), shadows=shadows, at=at)
+    options = {"camera": camera, "fps": fps, "size": _size(size), "shadows": shadows, "at": at}
+    with show.film_notes(console):
+        written = shoot(load(recording), path, **options)
     console.print(f"film: {written}")
 
 
@@ -184,10 +190,10 @@ def schema() -> None:
     typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
 
 
-def _mirror(recording: Any, rig: str, port: str | None, slow: bool, stop: str, path: Path) -> None:
+def _mirror(recording: Any, rig: str, path: Path, options: dict[str, Any]) -> None:
     from ...hardware.cli import play_recording
 
-    report = play_recording(recording, rig, port=port, slow=slow, stop=stop)
+    report = play_recording(recording, rig, **options)
     if report.recording is not None:
         console.print(f"the rig's recording: {report.recording.save(path)}")
     if report.status != "done":
@@ -202,7 +208,9 @@ def _draw(recording: Any, film_path: Path | None, plot_path: Path | None, out: P
     if film_path is not None:
         from ..shoot import shoot
 
-        console.print(f"film: {shoot(recording, _in(out, film_path))}")
+        with show.film_notes(console):
+            written = shoot(recording, _in(out, film_path))
+        console.print(f"film: {written}")
 
 
 def _in(out: Path, path: Path) -> Path:
