@@ -8,6 +8,7 @@ motion fits as well: the slowdown is computed, in closed form, not searched.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -118,15 +119,21 @@ def check_motion(
     servo_v, _ = mapping.rates(q, v, np.zeros_like(v))
     servo_v_knots, servo_a = mapping.rates(motion.q, motion.v, motion.a)
     owners = [np.flatnonzero(mapping.matrix[:, j]) for j in range(len(mapping.joints))]
+    units = [joints.unit(j) for j in range(len(mapping.joints))]
+    turns = ["rad"] * len(mapping.servos)
     tables = [
-        _position(mapping.joints, t, q, joints.low, joints.high, "joint"),
-        _power("speed", mapping.joints, t, v, joints.velocity, "/s", 1, "joint"),
-        _power("acceleration", mapping.joints, motion.t, motion.a, joints.acceleration, "/s^2", 2, "joint"),
+        _position(mapping.joints, t, q, joints.low, joints.high, "joint", units),
+        _power("speed", mapping.joints, t, v, joints.velocity, units, "/s", 1, "joint"),
+        _power(
+            "acceleration", mapping.joints, motion.t, motion.a, joints.acceleration, units, "/s^2", 2, "joint"
+        ),
     ]
     servo_tables = [
-        _position(mapping.servos, t, s, servos.low, servos.high, "servo"),
-        _power("speed", mapping.servos, t, servo_v, servos.velocity, "rad/s", 1, "servo"),
-        _power("acceleration", mapping.servos, motion.t, servo_a, servos.acceleration, "rad/s^2", 2, "servo"),
+        _position(mapping.servos, t, s, servos.low, servos.high, "servo", turns),
+        _power("speed", mapping.servos, t, servo_v, servos.velocity, turns, "/s", 1, "servo"),
+        _power(
+            "acceleration", mapping.servos, motion.t, servo_a, servos.acceleration, turns, "/s^2", 2, "servo"
+        ),
     ]
     notes: tuple[str, ...] = ()
     if loads is None:
@@ -161,7 +168,9 @@ def fit(motion: Motion, verdict: Verdict, *, slow: bool) -> Motion:
     return motion.slow(factor)
 
 
-def _position(names: tuple[str, ...], t: Array, q: Array, low: Array, high: Array, who: str) -> list[Check]:
+def _position(
+    names: tuple[str, ...], t: Array, q: Array, low: Array, high: Array, who: str, units: Sequence[str]
+) -> list[Check]:
     out = []
     for i, name in enumerate(names):
         beyond = np.maximum(q[:, i] - high[i], low[i] - q[:, i])
@@ -172,12 +181,20 @@ def _position(names: tuple[str, ...], t: Array, q: Array, low: Array, high: Arra
         share = 1 + float(beyond[k]) / half if np.isfinite(half) else 0.0
         limit = high[i] if q[k, i] - high[i] >= low[i] - q[k, i] else low[i]
         slower = np.inf if beyond[k] > slack else 1.0
-        out.append(Check("position", f"{who} {name}", q[k, i], limit, "", share, float(t[k]), slower))
+        out.append(Check("position", f"{who} {name}", q[k, i], limit, units[i], share, float(t[k]), slower))
     return out
 
 
 def _power(
-    kind: Kind, names: tuple[str, ...], t: Array, value: Array, limit: Array, unit: str, power: int, who: str
+    kind: Kind,
+    names: tuple[str, ...],
+    t: Array,
+    value: Array,
+    limit: Array,
+    units: Sequence[str],
+    per: str,
+    power: int,
+    who: str,
 ) -> list[Check]:
     """Limits on |value| that scale as x^power."""
     out = []
@@ -186,6 +203,7 @@ def _power(
         k = int(np.argmax(size))
         share = float(size[k] / limit[i])
         slower = 1.0 if share <= 1 + _SLACK else share ** (1 / power)
+        unit = units[i] + per
         out.append(Check(kind, f"{who} {name}", float(size[k]), limit[i], unit, share, float(t[k]), slower))
     return out
 

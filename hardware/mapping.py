@@ -254,6 +254,16 @@ class JointBounds:
     velocity: Array
     acceleration: Array
     torque: Array
+    units: tuple[str, ...] = ()
+
+    def unit(self, joint: int) -> str:
+        """Unit of a joint's position: rad, or m for one that slides."""
+        return self.units[joint] if self.units else "rad"
+
+
+def joint_units(rig: Rig) -> tuple[str, ...]:
+    """Units of the joints' positions: those with a crank or a table slide."""
+    return tuple("m" if item.crank or item.points else "rad" for item in rig.joints)
 
 
 def joint_bounds(rig: Rig, model: mujoco.MjModel | None = None) -> JointBounds:
@@ -268,7 +278,8 @@ def joint_bounds(rig: Rig, model: mujoco.MjModel | None = None) -> JointBounds:
                 low, high = (float(x) for x in model.jnt_range[index])
         rate = [x * unit if x else np.inf for x in (item.velocity, item.acceleration)]
         rows.append((low, high, *rate, item.torque or np.inf))
-    return JointBounds(*np.array(rows, dtype=float).T)
+    low, high, velocity, acceleration, torque = np.array(rows, dtype=float).T
+    return JointBounds(low, high, velocity, acceleration, torque, joint_units(rig))
 
 
 def park_pose(rig: Rig, start: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...sim.recording import Recording, model_to_bytes
 from ..driver import Driver, Statistics
 from ..limits import Verdict
-from ..mapping import Mapping, indices
+from ..mapping import Mapping, indices, joint_units
 from ..rig import Rig
 from ..virtual.motor import MOTORS
 from .contract import FEEDBACK
@@ -34,6 +34,7 @@ class Tracking:
     worst: float
     delay: float
     rms_aligned: float
+    unit: str = "rad"
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class MirrorReport:
             lines.append(f"  ran {self.slowed:.4g} times slower to fit the limits")
         for k in self.tracking:
             lines.append(
-                f"  {k.joint}: rms {k.rms:.4f}, worst {k.worst:.4f}, delay {k.delay * 1e3:.1f} ms, "
-                f"rms without delay {k.rms_aligned:.4f}"
+                f"  {k.joint}: rms {k.rms:.4f} {k.unit}, worst {k.worst:.4f} {k.unit}, "
+                f"delay {k.delay * 1e3:.1f} ms, rms without delay {k.rms_aligned:.4f} {k.unit}"
             )
         if self.timing:
             p50, p99, most = (1e3 * j for j in self.timing.jitter)
@@ -145,7 +146,8 @@ def make_report(
         commanded = mapping.joint(np.array([log.goal[i] for i in rows]))
         measured = _joints_heard(mapping, feedback[:, :, 0])
         tracking = tuple(
-            _track(name, t, commanded[:, j], measured[:, j]) for j, name in enumerate(mapping.joints)
+            replace(_track(name, t, commanded[:, j], measured[:, j]), unit=joint_units(rig)[j])
+            for j, name in enumerate(mapping.joints)
         )
         if model is not None and np.isfinite(measured).any(axis=0).all():
             recording = _recording(outcome, rig, mapping, model, t, feedback, measured, others, scene or {})
