@@ -68,6 +68,10 @@ def run(
     take_over: Annotated[
         bool, typer.Option("--take-over", help="Mirror: accept servos whose torque is on already.")
     ] = False,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Mirror: follow the simulation while it runs, unchecked beforehand."),
+    ] = False,
 ) -> None:
     """Run a scene; its recording is always saved."""
     from ..plan import make_plan
@@ -75,6 +79,13 @@ def run(
     from ..scene.load import load_scene
 
     plan = make_plan(load_scene(scene))
+    options: dict[str, Any] = {"port": port, "stop": stop, "take_over": take_over}
+    rig_motion = out / f"{scene.stem}-rig.npz"
+    if live:
+        if mirror is None:
+            raise PantographError("--live follows a simulation on a rig: name it with --mirror RIG")
+        _mirror(plan, mirror, rig_motion, options | {"live": True})
+        return
     with show.progress(f"simulating {scene.stem}", plan.problem.duration) as advance:
         recording = run_scene(plan, error=error, progress=advance)
     saved = recording.save(out / f"{scene.stem}.npz")
@@ -85,8 +96,7 @@ def run(
         _draw(recording, film, plot, out)
     _finish(recording)
     if mirror is not None:
-        options = {"port": port, "slow": slow, "stop": stop, "take_over": take_over}
-        _mirror(recording, mirror, out / f"{scene.stem}-rig.npz", options)
+        _mirror(recording, mirror, rig_motion, options | {"slow": slow})
 
 
 @app.command(epilog="Example: pantograph plan wave.toml")
@@ -112,7 +122,13 @@ def film(
     from ..recording import load
     from ..shoot import shoot
 
-    options = {"camera": camera, "fps": fps, "size": _size(size), "shadows": shadows, "at": at}
+    options: dict[str, Any] = {
+        "camera": camera,
+        "fps": fps,
+        "size": _size(size),
+        "shadows": shadows,
+        "at": at,
+    }
     with show.film_notes(console):
         written = shoot(load(recording), path, **options)
     console.print(f"film: {written}")
@@ -190,10 +206,10 @@ def schema() -> None:
     typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
 
 
-def _mirror(recording: Any, rig: str, path: Path, options: dict[str, Any]) -> None:
+def _mirror(motion: Any, rig: str, path: Path, options: dict[str, Any]) -> None:
     from ...hardware.cli import play_recording
 
-    report = play_recording(recording, rig, **options)
+    report = play_recording(motion, rig, **options)
     if report.recording is not None:
         console.print(f"the rig's recording: {report.recording.save(path)}")
     if report.status != "done":
