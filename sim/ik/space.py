@@ -59,6 +59,16 @@ class Space:
         self.q_of_v = np.full(self.nv, -1)
         self.q_of_v[self.scalar_v] = self.scalar_q
 
+    def coordinates(self, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which entries of q (nq,) belong to the freedoms in `moved` (nv,)."""
+        out = np.zeros(self.nq, dtype=bool)
+        out[self.q_of_v[np.flatnonzero(moved & (self.q_of_v >= 0))]] = True
+        for i, v in self.shifts:
+            out[i : i + 3] = moved[v : v + 3]
+        for ball in self.balls:
+            out[ball.q : ball.q + 4] = moved[ball.v]
+        return out
+
     def check(self, q: ArrayLike) -> Array:
         """`q` (nq,) on the manifold and inside the limits; ModelError when it is no configuration."""
         q = np.array(q, dtype=float)

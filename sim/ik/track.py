@@ -24,12 +24,12 @@ from ..errors import ModelError
 from ..kinds import BALL, FREE
 from ..rotation_curves import keyed_rotation
 from .band import Limits, smoothest_step
-from .stream import Follower, frozen, limit
 from .goals import Goal
 from .pose import Kinematics
 from .problem import Problem
 from .solve import residuals, solve
 from .space import Space
+from .stream import Follower, frozen, limit
 from .verdict import Residual, Verdict
 
 Array = NDArray[np.float64]
@@ -111,18 +111,22 @@ def follow(
     velocity: ArrayLike | None = None,
     acceleration: ArrayLike | None = None,
     start: ArrayLike | None = None,
+    around: ArrayLike | None = None,
     iterations: int = 15,
 ) -> Motion:
     """Motion of `model` along goals(t) at evenly spaced `times` (k,), smooth over the whole clip.
 
     `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
     by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
+    `around` (k, nq): motion of all joints that do not move for the goals, as keyed; default they stay as `q0`.
     Raises ModelError for times that are not evenly spaced.
     """
     t = np.asarray(times, dtype=float)
     if t.ndim != 1 or len(t) < 3 or not np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6) or t[1] <= t[0]:
         raise ModelError("a track needs at least three evenly spaced, increasing times")
-    line = _Line(model, goals, t, joints)
+    if around is not None and q0 is None:
+        q0 = np.asarray(around, dtype=float)[0]
+    line = _Line(model, goals, t, joints, around)
     v_max, a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
     q = _first_guess(line, q0, start, v_max, a_max)
     limits = Limits(line.space, float(t[1] - t[0]), v_max, a_max, start is not None)
@@ -133,13 +137,28 @@ def follow(
 class _Line:
     """Problems of all instants, over one model."""
 
-    def __init__(self, model: mujoco.MjModel, goals: Goals, t: Array, joints: Sequence[str] | None):
-        self.model, self.t, self.space = model, t, Space(model)
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        goals: Goals,
+        t: Array,
+        joints: Sequence[str] | None,
+        around: ArrayLike | None,
+    ):
+        self.model, self.t, self.space, self.joints = model, t, Space(model), joints
         kinematics = Kinematics(model)
         self.problems = [
             Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t
         ]
         self.moved = np.any([p.moved for p in self.problems], axis=0)
+        self.around = None if around is None else np.asarray(around, dtype=float)
+        if self.around is not None and self.around.shape != (len(t), model.nq):
+            raise ModelError(f"the motion around has shape {self.around.shape}, not ({len(t)}, {model.nq})")
+        self._ours = self.space.coordinates(self.moved)
+
+    def placed(self, k: int, q: Array) -> Array:
+        """q (nq,) with the joints that do not move for the goals as they are at instant k."""
+        return q if self.around is None else np.where(self._ours, q, self.around[k])
 
     def rows(self, q: Array) -> list[tuple[Array, Array]]:
         """Weighted residuals and Jacobians of every instant; judged rows count most."""
@@ -160,7 +179,7 @@ def _first_guess(
     if start is not None:
         starts = line.space.check(start)[None]
     else:
-        found = solve(model, first.goals, q0=q0, all=True, restarts=40)
+        found = solve(model, first.goals, q0=q0, joints=line.joints, all=True, restarts=40)
         starts = found.solutions[:_STARTS] if found.solved else found.q[None]
     best: tuple[float, Array] | None = None
     for q in starts:
@@ -174,9 +193,10 @@ def _first_guess(
 def _streamed(line: _Line, q: Array, v_max: Array) -> tuple[Array, float]:
     """Motion (k, nq) by one tick after the other, and its sum of squared deviations and accelerations."""
     dt = float(line.t[1] - line.t[0])
-    follower = Follower(line.model, dt=dt, q0=q, velocity=v_max)
+    follower = Follower(line.model, dt=dt, q0=q, velocity=v_max, joints=line.joints)
     out, cost = [q], 0.0
-    for problem in line.problems[1:]:
+    for k, problem in enumerate(line.problems[1:], start=1):
+        follower.q = line.placed(k, follower.q)
         tick = follower.step(problem.goals)
         w = problem.weighted(problem.raw(tick.q[None]))
         cost += float(np.sum(w.r**2)) / _TRACKING**2
@@ -237,7 +257,7 @@ def _stretches(
     edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(int)))
     for i, j in edges.reshape(-1, 2):
         k = int(i + np.argmax(position[i:j] + rotation[i:j]))
-        once = solve(line.model, line.problems[k].goals, q0=q[k], restarts=60)
+        once = solve(line.model, line.problems[k].goals, q0=q[k], joints=line.joints, restarts=60)
         verdict = None if once.solved else once.verdict
         out.append(
             Missed(

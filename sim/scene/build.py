@@ -18,6 +18,7 @@ from ..engines.prescribe import prescribed_bodies
 from ..errors import PantographError, SceneError
 from ..kinds import BALL, FREE, HINGE, SCALAR
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
+from .goals import bake
 from .mistakes import Mistake, report
 from .motion import Curves, constant_or_keyed, curves
 from .names import Names
@@ -69,11 +70,13 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     mistakes += _law(scene)
     found, wrong = curves(scene, model)
     mistakes += wrong
+    state0, wrong = _initial(scene, model)
+    mistakes += wrong
+    if scene.goals and not mistakes:
+        mistakes += bake(scene, model, found, state0.q)
     roles, wrong = _roles(scene, model, found)
     mistakes += wrong
     mistakes += apply_contacts(spec, model, scene)
-    state0, wrong = _initial(scene, model)
-    mistakes += wrong
     wrenches, wrong = _wrenches(scene, model)
     mistakes += wrong
     mistakes += _film_names(scene, model)

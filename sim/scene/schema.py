@@ -175,6 +175,39 @@ class KeysItem(Item):
         return self
 
 
+class GoalItem(Item):
+    """What a site or body does over time; joints without keys are solved for it (inverse kinematics)."""
+
+    at: str = Field(description="site, or body:NAME")
+    times: list[Finite] = Field(min_length=1, description="seconds, ascending")
+    position: list[Vector] | None = Field(None, description="of its origin, metres, one row a time")
+    rotation: list[Row] | None = Field(None, description="w, x, y, z or euler x, y, z, one row a time")
+    look_at: list[Vector] | None = Field(None, description="point that its axis points to, one row a time")
+    axis: Vector = Field((0.0, 0.0, 1.0), description="local axis that looks")
+    weight: Positive | None = Field(None, description="a wish of this weight; without it, a hard goal")
+    joints: list[str] = Field(default_factory=list, description="names or patterns that may move; default all")
+    curve: Curve = "auto"
+    ease: str | None = Field(None, description="easing between keys, instead of the curve's own timing")
+    before: Literal["hold", "loop"] = "hold"
+    after: Literal["hold", "loop"] = "hold"
+
+    @model_validator(mode="after")
+    def _something(self) -> GoalItem:
+        given = [w for w in ("position", "rotation", "look_at") if getattr(self, w) is not None]
+        if not given:
+            raise at(message="a goal says where to: give 'position', 'rotation', 'look_at', or several")
+        for word in given:
+            rows = getattr(self, word)
+            if len(rows) != len(self.times):
+                raise at(word, message=f"{len(self.times)} times but {len(rows)} rows; give one row a time")
+        _ascending(self.times)
+        try:
+            check_kind(self.curve, self.ease, self.before, self.after)
+        except KeyingError as e:
+            raise at("ease", message=str(e)) from None
+        return self
+
+
 def _ascending(times: list[float]) -> None:
     for t0, t1 in pairwise(times):
         if t1 <= t0:
@@ -309,6 +342,7 @@ class Scene(Item):
         default_factory=dict, description="actuator name or pattern -> what drives it; the last match rules"
     )
     keys: list[KeysItem] = Field(default_factory=list)
+    goals: list[GoalItem] = Field(default_factory=list)
     forces: list[ForceItem] = Field(default_factory=list)
     controller: ControllerItem | None = None
     physics: Physics = Physics()

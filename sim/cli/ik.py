@@ -1,0 +1,136 @@
+"""The command `pantograph ik`: a pose from a goal, with its verdict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from ..errors import PantographError
+
+if TYPE_CHECKING:
+    from ..ik import Goal, Solution
+
+console = Console()
+
+
+def ik(
+    model: Annotated[str, typer.Argument(help="Built-in model or model file; see 'pantograph models'.")],
+    to: Annotated[str, typer.Option(help="Target: x,y,z [m], or x,y,z,qw,qx,qy,qz.")],
+    site: Annotated[str | None, typer.Option(help="Site to bring there; body:NAME for a body.")] = None,
+    joint: Annotated[list[str] | None, typer.Option(help="Joint that may move; default all.")] = None,
+    keyframe: Annotated[str | None, typer.Option(help="Keyframe of the model to start from.")] = None,
+    prefer: Annotated[str, typer.Option(help="near, middle or manipulability.")] = "near",
+    every: Annotated[bool, typer.Option("--all", help="List all distinct solutions.")] = False,
+    film: Annotated[
+        Path | None, typer.Option(help="Film the way there: .mp4, .gif, or a picture .png.")
+    ] = None,
+    restarts: Annotated[int, typer.Option(help="Random starts before giving up.", min=0)] = 200,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+) -> None:
+    """Bring a site to a place: prints the pose and whether, or why not, it can be met."""
+    from ...models import load_model
+    from ..ik import solve
+
+    loaded = load_model(model)
+    start = _start(loaded, keyframe)
+    goal = _goal(loaded, site, to)
+    solution = solve(
+        loaded, goal, q0=start, joints=joint, prefer=prefer, restarts=restarts, seed=seed, all=every  # type: ignore[arg-type]
+    )  # fmt: skip
+    _show(loaded, solution, start)
+    if film is not None:
+        console.print(f"film: {_film(loaded, start, solution.q, film)}")
+    if not solution.solved:
+        raise typer.Exit(1)
+
+
+def _start(model: Any, keyframe: str | None) -> Any:
+    if keyframe is None:
+        return model.qpos0
+    names = [model.key(k).name for k in range(model.nkey)]
+    if keyframe not in names:
+        raise PantographError(
+            f"no keyframe {keyframe!r}; the model has: {', '.join(filter(None, names)) or 'none'}"
+        )
+    return model.key_qpos[names.index(keyframe)]
+
+
+def _goal(model: Any, site: str | None, to: str) -> Goal:
+    """The goal of the words of the command line."""
+    from ...models import names_of
+    from ..ik import Pose, Position
+
+    sites = [name for name in names_of(model, "site")]
+    if site is None:
+        if len(sites) != 1:
+            raise PantographError(
+                f"name the site to move with --site; the model has: {', '.join(sites) or 'none'}"
+            )
+        site = sites[0]
+    try:
+        numbers = [float(x) for x in to.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 7):
+        raise PantographError(f"--to is x,y,z or x,y,z,qw,qx,qy,qz, not {to!r}")
+    return Position(site, numbers) if len(numbers) == 3 else Pose(site, numbers[:3], numbers[3:])
+
+
+def _show(model: Any, solution: Solution, start: Any) -> None:
+    color = "green" if solution.solved else "red"
+    console.print(f"[bold {color}]{escape(str(solution.verdict))}[/]", highlight=False, soft_wrap=True)
+    answers = solution.solutions if len(solution.solutions) > 1 else [solution.q]
+    table = Table()
+    table.add_column("joint")
+    for k in range(len(answers)):
+        table.add_column("value" if len(answers) == 1 else str(k + 1), justify="right")
+    table.add_column("range", justify="right")
+    for name, cells, limits in _rows(model, answers, start):
+        table.add_row(escape(name), *cells, limits)
+    console.print(table)
+    for r in solution.residuals:
+        console.print(
+            f"{escape(r.goal)}: {r.position:.3g} m, {r.rotation:.3g} rad {'met' if r.met else 'not met'}"
+        )
+    console.print(f"{solution.seconds * 1e3:.0f} ms, {solution.restarts} restarts")
+
+
+def _rows(model: Any, answers: Any, start: Any) -> list[tuple[str, list[str], str]]:
+    """Joints that moved: name, a cell for every answer, range."""
+    from ...models import name_of
+    from ..kinds import BALL, FREE, HINGE
+
+    out = []
+    for j in range(model.njnt):
+        at, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
+        part = slice(at, at + {FREE: 7, BALL: 4}.get(kind, 1))
+        if all(abs(q[part] - start[part]).max() < 1e-12 for q in answers):
+            continue
+        unit = "rad" if kind == HINGE else "m" if kind not in (FREE, BALL) else ""
+        cells = [" ".join(f"{x:.6g}" for x in q[part]) + f" {unit}" for q in answers]
+        low, high = model.jnt_range[j]
+        out.append(
+            (name_of(model, "joint", j), cells, f"{low:.4g} to {high:.4g}" if model.jnt_limited[j] else "")
+        )
+    return out
+
+
+def _film(model: Any, start: Any, q: Any, path: Path) -> Path:
+    """The way from the start to the answer in two seconds, or a picture of the answer."""
+    import numpy as np
+
+    from ..film import film, still
+    from ..ik import blend
+
+    if path.suffix.lower() == ".png":
+        return still(model, q, path)
+    t = np.linspace(0.0, 2.0, 61)
+    x = np.clip((t - 0.3) / 1.2, 0.0, 1.0)
+    share = x * x * (3 - 2 * x)
+    way = blend(model, np.tile(start, (len(t), 1)), np.tile(q, (len(t), 1)), share)
+    return film(model, t, way, path)

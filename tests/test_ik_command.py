@@ -1,0 +1,50 @@
+"""The command `pantograph ik`."""
+
+import pytest
+import typer
+from pantograph.sim.cli.ik import ik
+from pantograph.sim.errors import PantographError
+from typer.testing import CliRunner
+
+
+def _run(*words):
+    app = typer.Typer()
+    app.command()(ik)
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if isinstance(result.exception, PantographError):
+        raise result.exception
+    return result.exit_code, " ".join(result.output.split())
+
+
+def test_a_pose_is_printed_with_its_verdict():
+    code, text = _run("planar_2r", "--to", "1.2,0,1.4", "--all")
+    assert code == 0
+    assert "solved" in text and "shoulder" in text and "elbow" in text and "position tip" in text
+
+
+def test_a_negative_verdict_fails_and_tells_the_distance():
+    code, text = _run("planar_2r", "--to", "2.5,0,2", "--site", "tip")
+    assert code == 1
+    assert "out of reach" in text and "0.7 m" in text and "proved" in text
+
+
+def test_the_way_can_be_pictured(tmp_path):
+    pytest.importorskip("pyrender")
+    code, text = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
+    assert code == 0
+    assert (tmp_path / "pose.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("arm6", "--to", "1,2"), "x,y,z"),
+        (("arm6", "--to", "1,2,a"), "x,y,z"),
+        (("puppet", "--to", "1,2,3"), "--site"),
+        (("arm6", "--to", "1,0,0", "--site", "tipp"), "tip"),
+        (("arm6", "--to", "1,0,0", "--keyframe", "none such"), "no keyframe"),
+    ],
+)
+def test_mistakes_are_told(words, message):
+    with pytest.raises(PantographError, match=message):
+        _run(*words)
