@@ -171,7 +171,7 @@ def test_our_models_agree_over_the_whole_state_space(path):
 def test_nearly_parallel_axes_and_dust_beside_boulders_cost_no_accuracy():
     xml = """<mujoco><compiler angle="radian"/><worldbody><body>
       <joint axis="0 0 1"/><geom type="box" size="2 2 2" mass="1000"/>
-      <body pos="1 0 .5" euler="{tilt} 0 0"><joint axis="0 0 1"/><geom type="box" size=".3 .2 .1" mass="1"/>
+      <body pos="1 .7 .5" euler="{tilt} 0 0"><joint axis="0 0 1"/><geom type="box" size=".3 .2 .1" mass="1"/>
       <body pos="1 0 0" euler="1.5708 0 0"><joint axis="0 0 1"/>
       <inertial pos=".001 .002 0" mass="1e-5" diaginertia="1e-12 2e-12 2.5e-12"/></body></body></body>
       </worldbody></mujoco>"""

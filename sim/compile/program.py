@@ -122,7 +122,8 @@ def address(array: Array) -> int:
     if not array.size:
         return 0
     try:
-        return ctypes.addressof(ctypes.c_double.from_buffer(array.data))  # a quarter of what NumPy's own ways cost
+        # a quarter of what NumPy's own ways cost
+        return ctypes.addressof(ctypes.c_double.from_buffer(array.data))
     except (TypeError, ValueError):  # read-only
         place: int = array.ctypes.data
         return place
