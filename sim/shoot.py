@@ -25,14 +25,22 @@ def shoot(
     fps: float | None = None,
     shadows: bool | None = None,
     at: float | None = None,
+    beside: Recording | None = None,
     progress: bool = True,
 ) -> Path:
     """Film a recording, or take one picture of it ``at`` a time [s]; returns the path written.
+
+    ``beside`` is another recording of the same model, such as what a rig made of it, drawn to the right.
 
     What is not given comes from the scene: camera by name (of the scene or of the model file), size in
     pixels, frames per second, shadows. Raises FilmError for an unknown camera, an empty recording or
     what :func:`pantograph.sim.film.film` raises.
     """
+    if beside is not None and beside.q.shape[1] != recording.q.shape[1]:
+        raise FilmError(
+            f"the recording beside has {beside.q.shape[1]} coordinates, this one {recording.q.shape[1]}: "
+            "both must be of the same model"
+        )
     if not len(recording.t):
         raise FilmError("the recording is empty; there is nothing to film")
     scene = Scene(**recording.scene)
@@ -60,6 +68,7 @@ def shoot(
         recording.t,
         recording.q,
         path,
+        beside=None if beside is None else (beside.t, beside.q),
         camera=view,
         lights=lights,
         fps=fps or scene.film.fps,

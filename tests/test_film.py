@@ -17,6 +17,7 @@ from pantograph.sim.film import Camera, Light, Renderer, default_lights, film, r
 from pantograph.sim.film.cameras import look_at
 from pantograph.sim.film.context import Context
 from pantograph.sim.film.shapes import Shape, coarse, crease_normals, geom_shape
+from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -835,3 +836,26 @@ def test_bad_motions_are_refused(tmp_path, t, q, says):
     with pytest.raises(FilmError) as caught:
         film(free(GEOMS["box"]), t, q, tmp_path / "f.mp4")
     assert says in str(caught.value)
+
+
+def test_a_second_motion_is_drawn_to_the_right(tmp_path):
+    """Two motions of one ball: left picture as alone, right picture as the other alone."""
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="ball")
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    body.add_geom(size=[0.2, 0, 0], rgba=[0.9, 0.1, 0.1, 1])
+    model = spec.compile()
+    camera = Camera("c", position=(0.0, -3.0, 0.0), target=(0.0, 0.0, 0.0))
+    t, up, down = [0.0, 0.1], [[0.0], [0.5]], [[0.0], [-0.5]]
+    options = {"camera": camera, "fps": 10, "size": (96, 64), "progress": False}
+
+    def frames(name, q, **more):
+        film(model, t, q, tmp_path / name / "f_%04d.png", **options, **more)
+        return [np.asarray(Image.open(p)) for p in sorted((tmp_path / name).glob("*.png"))]
+
+    for name in ("both", "up", "down"):
+        (tmp_path / name).mkdir()
+    both = frames("both", up, beside=(t, down))
+    for picture, left, right in zip(both, frames("up", up), frames("down", down), strict=True):
+        np.testing.assert_array_equal(picture, np.concatenate([left, right], axis=1))
+    assert not np.array_equal(both[1][:, :96], both[1][:, 96:])

@@ -117,6 +117,9 @@ def film(
     size: Annotated[str | None, typer.Option(help="Picture size, as 640x480.")] = None,
     shadows: Annotated[bool | None, typer.Option(help="Draw shadows; default as the scene says.")] = None,
     at: Annotated[float | None, typer.Option(help="One picture at this time [s] instead of a film.")] = None,
+    beside: Annotated[
+        Path | None, typer.Option(help="Another recording of the same model, such as a rig's, to the right.")
+    ] = None,
 ) -> None:
     """Film a recording without simulating again."""
     from ..recording import load
@@ -129,6 +132,8 @@ def film(
         "shadows": shadows,
         "at": at,
     }
+    if beside is not None:
+        options["beside"] = load(beside)
     with show.film_notes(console):
         written = shoot(load(recording), path, **options)
     console.print(f"film: {written}")

@@ -26,6 +26,7 @@ def film(
     q: ArrayLike,
     path: str | os.PathLike[str],
     *,
+    beside: tuple[ArrayLike, ArrayLike] | None = None,
     camera: Camera | None = None,
     lights: Sequence[Light] | None = None,
     fps: float = 30.0,
@@ -38,6 +39,7 @@ def film(
     What `path` may be: see `write`. Without a `camera`, one that frames the whole motion; without `lights`,
     the model file's or, when it has none, three of our own. Frames fall at t[0] + k / fps; between samples
     the motion is interpolated on the manifold (shortest rotations). `size` is (width, height) in pixels.
+    `beside` is a second motion (times, q) of the same model, drawn to the right as the same camera sees it.
     A FilmWarning names what of the model is not drawn.
 
     Raises FilmError for times that do not rise, wrong shapes, values that are not finite, or a missing
@@ -50,8 +52,11 @@ def film(
     view = (camera or Camera.auto(model, motion, aspect=size[0] / size[1])).follow(model, times, motion)
     with Renderer(model, width=size[0], height=size[1], lights=lights, shadows=shadows) as renderer:
         _tell(renderer.not_drawn)
+        motions = [(times, motion)] if beside is None else [(times, motion), _checked(model, *beside)]
+        poses = zip(*(resampled(model, *each, shot) for each in motions), strict=True)
         frames = (
-            renderer.render(q_k, t_k, camera=view) for t_k, q_k in resampled(model, times, motion, shot)
+            np.concatenate([renderer.render(q_k, t_k, camera=view) for t_k, q_k in pair], axis=1)
+            for pair in poses
         )
         return write(path, frames, fps=fps, total=len(shot), progress=progress)
 
