@@ -33,8 +33,10 @@ def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
     from ...controllers.cli import control
     from ...hardware.cli import app as servo
+    from .ik import ik
 
     app.add_typer(servo)
+    app.command(epilog="Example: pantograph ik arm6 --site tip --to 0.4,0.1,0.5 --film reach.mp4")(ik)
     app.command(epilog="Example: pantograph control wave.toml --compare pd,computed-torque")(control)
     try:
         app()
