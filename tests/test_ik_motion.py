@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import ik_cases
+from oracles.ik_motions import figure_eight, walk, wrist_arm
 from pantograph.models import ModelError, load_model
 from pantograph.sim.ik import Follower, JointValue, Pole, Pose, Position, blend, follow, lock, soften, solve
 from pantograph.sim.ik.band import _Banded, _interior
@@ -14,29 +15,9 @@ from pantograph.sim.kinematics import frame
 from strategies import seeds
 
 
-def _wrist_arm(limits=2.9):
-    """Six hinges with a spherical wrist that is singular at zero."""
-    axes = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
-    offsets = [[0, 0, 0], [0, 0, 0.3], [0, 0, 0.4], [0, 0, 0.35], [0, 0, 0], [0, 0, 0]]
-    links = [(o, ik_cases.HINGE, a, (-limits, limits)) for o, a in zip(offsets, axes, strict=True)]
-    return ik_cases.chain([*links, ([0, 0, 0.1], None, None, None)])
-
-
-def _eight(model, *, period=4.0):
-    """A figure-eight of the tip whose middle has the wrist exactly singular, orientation kept."""
-    q = np.array([0.2, 0.7, 1.1, 0.3, 0.0, 0.0])
-    p, quat = ik_cases.pose_of(model, q, "tip")
-
-    def goals(t):
-        w = 2 * np.pi * t / period
-        return [Pose("tip", p + [0.02 * np.sin(2 * w), 0.06 * np.sin(w), 0.0], quat)]
-
-    return q, goals
-
-
 def test_a_figure_eight_through_a_wrist_singularity_streams_within_limits_and_tells_its_deviation():
-    model = _wrist_arm()
-    q, goals = _eight(model)
+    model = wrist_arm()
+    q, goals = figure_eight(model)
     dt, v_max, a_max = 0.02, 2.0, 30.0
     follower = Follower(model, dt=dt, q0=q, velocity=v_max, acceleration=a_max)
     before, worst, told = np.zeros(model.nv), 0.0, 0.0
@@ -55,8 +36,8 @@ def test_a_figure_eight_through_a_wrist_singularity_streams_within_limits_and_te
 
 
 def test_a_whole_figure_eight_is_smooth_and_follows_better_than_streaming():
-    model = _wrist_arm()
-    q, goals = _eight(model)
+    model = wrist_arm()
+    q, goals = figure_eight(model)
     times = np.arange(0, 4, 0.04)
     motion = follow(model, goals, times, q0=q, velocity=2.0, acceleration=30.0)
     assert motion.speed <= 1.0 and motion.effort <= 1.0
@@ -214,24 +195,9 @@ def test_banded_programmes_agree_with_an_independent_solver(seed):
     assert cost(x.ravel()) <= found.fun + 1e-3 * abs(found.fun)
 
 
-def _walk(model, times):
-    """A puppet that drifts forward while its legs swing: feet slide unless they are locked."""
-    q = np.tile(model.qpos0, (len(times), 1))
-    w = 2 * np.pi * times
-    q[:, 0] += 0.1 * times
-    q[:, 2] -= 0.02 + 0.01 * np.sin(w)
-    for side, phase in (("left", 0.0), ("right", np.pi)):
-        for joint, wave in (
-            ("hip_pitch", 0.25 * np.sin(w + phase)),
-            ("knee", 0.3 + 0.25 * np.sin(w + phase + 1)),
-        ):
-            q[:, model.joint(f"{side}_{joint}").qposadr[0]] += wave
-    return q
-
-
 def test_a_locked_foot_does_not_slide():
     model, times = load_model("puppet"), np.arange(0, 1.5, 1 / 30)
-    q = _walk(model, times)
+    q = walk(model, times)
     stances = {"left_foot": [(0.2, 0.5)], "right_foot": [(0.7, 1.0)]}
     locked = lock(model, times, q, stances)
     for foot, ((start, end),) in stances.items():

@@ -18,15 +18,18 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from arms import bare, panda, ur5  # noqa: E402
-from oracles import ik_cases  # noqa: E402
+from oracles import ik_cases, ik_loops  # noqa: E402
+from oracles.ik_motions import figure_eight, walk, wrist_arm  # noqa: E402
 from pantograph.models import data_robots, load_model  # noqa: E402
-from pantograph.sim.ik import ChainSolver, solve  # noqa: E402
+from pantograph.sim.ik import ChainSolver, Follower, Loops, follow, lock, solve  # noqa: E402
 from pantograph.sim.kinematics import frame  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-BUDGET = 5e-3  # [s], of the TRAC-IK protocol; of processor time, so that other work on the machine does not count
+BUDGET = (
+    5e-3  # [s], of the TRAC-IK protocol; of processor time, so that other work on the machine does not count
+)
 TOLERANCE = 1e-5
 RANDOM_TARGETS, PEER_TARGETS, CASES = 10_000, 200, 1000
 ENVIRONMENT = HERE.parents[1] / ".bench" / "ik"
@@ -178,8 +181,19 @@ def protocol(console):
     import tempfile
 
     absent = environment()
-    table = Table(title=f"TRAC-IK protocol: {TOLERANCE:g} in every component, from mid-range, {BUDGET * 1e3:g} ms")
-    for column in ("arm", "solver", "targets", "solved in 5 ms", "mean", "median", "99 %", "solved in 100 ms"):
+    table = Table(
+        title=f"TRAC-IK protocol: {TOLERANCE:g} in every component, from mid-range, {BUDGET * 1e3:g} ms"
+    )
+    for column in (
+        "arm",
+        "solver",
+        "targets",
+        "solved in 5 ms",
+        "mean",
+        "median",
+        "99 %",
+        "solved in 100 ms",
+    ):
         table.add_column(column, justify="left" if column in ("arm", "solver") else "right")
     figures = []
     for name, model, R, p in questions():
@@ -203,8 +217,18 @@ def protocol(console):
                     rows.append((solver, f"absent: {absent}", None))
                     continue
                 quick = peer(solver, model, R[few], p[few], BUDGET, Path(folder))
-                slow = quick if isinstance(quick, str) else peer(solver, model, R[few], p[few], 0.1, Path(folder))
-                rows.append((solver, slow if isinstance(slow, str) else quick, None if isinstance(slow, str) else slow))
+                slow = (
+                    quick
+                    if isinstance(quick, str)
+                    else peer(solver, model, R[few], p[few], 0.1, Path(folder))
+                )
+                rows.append(
+                    (
+                        solver,
+                        slow if isinstance(slow, str) else quick,
+                        None if isinstance(slow, str) else slow,
+                    )
+                )
         for solver, quick, slow in rows:
             if isinstance(quick, str):
                 table.add_row("", solver, quick)
@@ -215,7 +239,9 @@ def protocol(console):
             table.add_row("", solver, str(len(t)), f"{100 * m.mean():.1f} %", f"{us.mean():.0f} us",
                           f"{np.median(us):.0f} us", f"{np.percentile(us, 99):.0f} us", f"{100 * m_late.mean():.1f} %")  # fmt: skip
             figures.append(told(f"{name}: {solver} solved in 5 ms", m.mean(), "share"))
-            figures.append(told(f"{name}: {solver} mean over ours", us.mean() / (seconds.mean() * 1e6), "ratio"))
+            figures.append(
+                told(f"{name}: {solver} mean over ours", us.mean() / (seconds.mean() * 1e6), "ratio")
+            )
     console.print(table)
     return figures
 
@@ -273,7 +299,91 @@ def verdicts(console):
     return [*figures, at_most("wrong verdicts", total / (CASES * len(FAMILIES)), 1e-3 * (1 - 1e-9), "share")]
 
 
-PARTS = {"protocol": protocol, "verdicts": verdicts}
+# Along time.
+
+
+def motion(console):
+    """A walk with locked feet, and a figure-eight through a wrist singularity."""
+    puppet, times = load_model("puppet"), np.arange(0, 3, 1 / 60)
+    stances = {"left_foot": [(0.2, 0.5), (1.2, 1.5), (2.2, 2.5)], "right_foot": [(0.7, 1.0), (1.7, 2.0)]}
+    begin = time.thread_time()
+    locked = lock(puppet, times, walk(puppet, times), stances)
+    spent = time.thread_time() - begin
+    slip = 0.0
+    for foot, spans in stances.items():
+        places = frame(puppet, "site", foot).pose(locked.q)[:, :3, 3]
+        for start, end in spans:
+            on = (times >= start) & (times <= end)
+            slip = max(slip, float(np.linalg.norm(places[on] - places[on][0], axis=1).max()))
+    figures = [at_most("locked foot: largest slip", 1e3 * slip, 0.1, "mm"),
+               told("locked feet: time a frame", 1e3 * spent / len(times), "ms")]  # fmt: skip
+    arm = wrist_arm()
+    q, goals = figure_eight(arm)
+    dt, speed, effort = 0.01, 2.0, 30.0
+    f = frame(arm, "site", "tip")
+    follower = Follower(arm, dt=dt, q0=q, velocity=speed, acceleration=effort)
+    worst_v = worst_a = far = untold = 0.0
+    before, begin = np.zeros(arm.nv), time.thread_time()
+    for k in range(800):
+        tick = follower.step(goals(k * dt))
+        true = float(np.linalg.norm(f.pose(tick.q)[:3, 3] - goals(k * dt)[0].position))
+        untold = max(untold, abs(true - tick.residuals[0].position))
+        worst_v = max(worst_v, float(np.abs(tick.v).max()))
+        worst_a = max(worst_a, float(np.abs(tick.v - before).max()) / dt)
+        before, far = tick.v, max(far, true)
+    each = (time.thread_time() - begin) / 800
+    begin = time.thread_time()
+    whole = follow(arm, goals, np.arange(0, 4, dt), q0=q, velocity=speed, acceleration=effort)
+    spent = time.thread_time() - begin
+    steps = np.diff(whole.q, axis=0) / dt
+    figures += [
+        at_most("figure-eight live: joint speed over its limit", worst_v / speed, 1 + 1e-9, "ratio"),
+        at_most("figure-eight live: acceleration over its limit", worst_a / effort, 1 + 1e-6, "ratio"),
+        at_most("figure-eight live: deviation not reported", untold, 1e-9, "m"),
+        told("figure-eight live: largest deviation", 1e3 * far, "mm"),
+        told("figure-eight live: time a tick", 1e3 * each, "ms"),
+        at_most("figure-eight whole: joint speed over its limit", np.abs(steps).max() / speed, 1 + 1e-9, "ratio"),
+        at_most("figure-eight whole: acceleration over its limit",
+                np.abs(np.diff(steps, axis=0)).max() / dt / effort, 1 + 1e-6, "ratio"),
+        told("figure-eight whole: largest deviation", 1e3 * whole.position.max(), "mm"),
+        told("figure-eight whole: time", spent, "s"),
+    ]  # fmt: skip
+    return figures
+
+
+# Closed loops.
+
+
+def loops(console):
+    """A four-bar and a Stewart platform closed from random starts; openings by MuJoCo's own constraints."""
+    rng = np.random.default_rng(0)
+    bar, (plate, _) = ik_loops.four_bar(), ik_loops.stewart()
+    figures = []
+    for name, model, count in (("four-bar", bar, 1000), ("Stewart platform", plate, 300)):
+        closing, data, worst, spent = Loops(model), mujoco.MjData(model), 0.0, 0.0
+        for _ in range(count):
+            q = model.qpos0.copy()
+            held = np.zeros(model.nv, dtype=bool)
+            if model is bar:
+                q[0] = rng.uniform(-np.pi, np.pi)
+                q[1:] = ik_loops.four_bar_angles(q[0])[0] + 0.2 * rng.normal(size=2)
+                held[0] = True
+            else:
+                q[:3] += 0.1 * rng.normal(size=3)
+                mujoco.mju_axisAngle2Quat(q[3:7], ik_cases.unit(rng), 0.3 * rng.normal())
+                held[:6] = True
+            begin = time.thread_time()
+            found = closing.project(q, held=held)
+            spent += time.thread_time() - begin
+            data.qpos[:] = found.q
+            mujoco.mj_forward(model, data)
+            worst = max(worst, float(np.abs(data.efc_pos[: data.ne]).max()))
+        figures.append(at_most(f"{name}: largest opening", worst, 1e-12, "m"))
+        figures.append(told(f"{name}: time", 1e3 * spent / count, "ms"))
+    return figures
+
+
+PARTS = {"motion": motion, "loops": loops, "protocol": protocol, "verdicts": verdicts}
 
 
 def main():
@@ -284,7 +394,9 @@ def main():
     for column in ("figure", "value", "unit", "bar", "holds"):
         table.add_column(column)
     for f in figures:
-        table.add_row(f.name, f"{f.value:.6g}", f.unit, f.bar, "" if f.holds is None else "yes" if f.holds else "NO")
+        table.add_row(
+            f.name, f"{f.value:.6g}", f.unit, f.bar, "" if f.holds is None else "yes" if f.holds else "NO"
+        )
     console.print(table)
     print(json.dumps({f.name: asdict(f) for f in figures}))
     sys.exit(0 if all(f.holds is not False for f in figures) else 1)

@@ -296,7 +296,9 @@ def limited_elbow(rng):
     a, b = rng.uniform(0.3, 1.0, 2)
     low, high = sorted(rng.uniform(0.1, 2.9, 2))
     high = max(high, low + 0.2)
-    bend = rng.uniform(0.02, low - 0.03) if low > 0.1 and rng.random() < 0.5 else rng.uniform(high + 0.03, 3.1)
+    bend = (
+        rng.uniform(0.02, low - 0.03) if low > 0.1 and rng.random() < 0.5 else rng.uniform(high + 0.03, 3.1)
+    )
     distance = np.sqrt(a * a + b * b + 2 * a * b * np.cos(bend))
     z, y = (0, 0, 1), (0, 1, 0)
     links = [([0, 0, 0], BALL, z, None), ([a, 0, 0], HINGE, y, (low, high)), ([b, 0, 0], None, None, None)]
@@ -365,7 +367,9 @@ def conflict_heading(rng):
     if np.abs(planar.wrap(headings - heading)).min() < 0.01:
         return conflict_heading(rng)
     goals = [Position("tip", [*p, 0], name="place"), Orientation("tip", quat_z(heading), name="heading")]
-    return Case("point and heading", planar_chain(lengths), goals, "conflict", labels=frozenset(["place", "heading"]))
+    return Case(
+        "point and heading", planar_chain(lengths), goals, "conflict", labels=frozenset(["place", "heading"])
+    )
 
 
 def conflict_value(rng):
@@ -375,8 +379,13 @@ def conflict_value(rng):
     bend = rng.uniform(-3, 3)
     if abs(abs(bend) - abs(q[1])) < 0.01:
         return conflict_value(rng)
-    goals = [Position("tip", [*planar.forward(lengths, q)[-1], 0], name="place"), JointValue("j1", bend, name="bend")]
-    return Case("point and bend", planar_chain(lengths), goals, "conflict", labels=frozenset(["place", "bend"]))
+    goals = [
+        Position("tip", [*planar.forward(lengths, q)[-1], 0], name="place"),
+        JointValue("j1", bend, name="bend"),
+    ]
+    return Case(
+        "point and bend", planar_chain(lengths), goals, "conflict", labels=frozenset(["place", "bend"])
+    )
 
 
 def conflict_of_two_in_three(rng):
@@ -396,7 +405,14 @@ def conflict_of_two_in_three(rng):
 REACHABLE = (reachable_pose, reachable_point, reachable_at_limit, reachable_stretched, reachable_wrist,
              reachable_several)  # fmt: skip
 BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt)
-LIMITED = (limited_two_links, limited_three_links, limited_elbow, limited_value, limited_direction, beyond_slides)
+LIMITED = (
+    limited_two_links,
+    limited_three_links,
+    limited_elbow,
+    limited_value,
+    limited_direction,
+    beyond_slides,
+)
 CONFLICT = (conflict_one_site, conflict_too_far, conflict_heading, conflict_value, conflict_of_two_in_three)
 
 

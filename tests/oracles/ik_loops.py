@@ -61,7 +61,9 @@ def stewart(*, seed=0):
         leg.add_joint(name=f"b{i}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
         leg.add_geom(size=[0.02, 0, 0], mass=1, contype=0, conaffinity=0)
         rod = leg.add_body(name=f"rod{i}", pos=[0, 0, length])
-        rod.add_joint(name=f"s{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], range=[-0.5, 0.5], limited=True)
+        rod.add_joint(
+            name=f"s{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], range=[-0.5, 0.5], limited=True
+        )
         rod.add_geom(size=[0.02, 0, 0], mass=1, contype=0, conaffinity=0)
         rod.add_site(name=f"foot{i}")
         plate.add_site(name=f"ball{i}", pos=top)
