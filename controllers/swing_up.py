@@ -79,7 +79,7 @@ class SwingUp:
         *,
         goal: Mapping[str, float] | None = None,
         foresight: float = 12.0,
-        tries: int = 48,
+        tries: int = 128,
         every: float = 2.0,
         room: float = 0.05,
         seed: int = 1,

@@ -7,12 +7,14 @@ named: python tests/bench/control.py gains tracking swing_up
 import json
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from control_figures import Figure, at_least, at_most, info
+from control_fit import PARTS as FIT
 from pantograph.controllers.basin import Catch, map_basin, picture
 from pantograph.controllers.design import LinearSystem, dlqr, held, lqr
 from pantograph.controllers.experiments import compare
@@ -33,29 +35,6 @@ from oracles import control_gains
 STARTS, SWING_S, STAY_S, PERIOD = 1000, 15.0, 10.0, 0.01
 ARM = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll"]
 OUT = Path("out")
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One measured number and the bar it must reach."""
-
-    name: str
-    value: float
-    unit: str
-    bar: str
-    holds: bool
-
-
-def at_most(name: str, value: float, bar: float, unit: str) -> Figure:
-    return Figure(name, value, unit, f"<= {bar:g}", bool(value <= bar))
-
-
-def at_least(name: str, value: float, bar: float, unit: str) -> Figure:
-    return Figure(name, value, unit, f">= {bar:g}", bool(value >= bar))
-
-
-def info(name: str, value: float, unit: str) -> Figure:
-    return Figure(name, value, unit, "", True)
 
 
 def gains(console: Console) -> list[Figure]:
@@ -188,7 +167,7 @@ def robust(console: Console) -> list[Figure]:
     ]
 
 
-PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up}
+PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **FIT}
 
 
 def main() -> int:

@@ -1,0 +1,102 @@
+"""What a machine can do: limits of every degree of freedom, and of its battery."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim.errors import PantographError
+from ...sim.kinds import SCALAR
+from ..gains import force_limits, per_joint
+from ..nominal import Nominal
+
+Array = NDArray[np.float64]
+Limit = float | Mapping[str, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """Limits of each degree of freedom (nv,); infinite where there is none.
+
+    ``low``, ``high`` [rad, m]; ``velocity`` [rad/s, m/s]; ``acceleration`` [rad/s^2, m/s^2]; ``jerk``
+    [rad/s^3, m/s^3]; ``force_low``, ``force_high`` at standstill [N m, N]; ``top_speed``: where a motor gives
+    nothing more (its force falls in a straight line); ``current`` [A] of the battery, drawn at ``ampere``
+    [A/(N m), A/N] of each joint's force. ``driven`` (nv,): freedoms with a drive; the others take no force.
+    """
+
+    nominal: Nominal
+    low: Array
+    high: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    force_low: Array
+    force_high: Array
+    top_speed: Array
+    ampere: Array
+    current: float
+    driven: NDArray[np.bool_]
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The machine's model, without its actuators."""
+        return self.nominal.model
+
+
+def machine(
+    model: mujoco.MjModel,
+    *,
+    velocity: Limit = None,
+    acceleration: Limit = None,
+    jerk: Limit = None,
+    force: Limit = None,
+    top_speed: Limit = None,
+    ampere: Limit = None,
+    current: float = np.inf,
+    driven: NDArray[np.bool_] | None = None,
+) -> Machine:
+    """The machine of a model: ranges and forces as its file says, the rest as given (None: no limit).
+
+    A limit is one number, or one a joint by name (other joints have none); ``force`` replaces the file's.
+    Raises PantographError for negative limits and names of no joint.
+    """
+    low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    for joint in np.flatnonzero(model.jnt_limited):
+        if int(model.jnt_type[joint]) in SCALAR:
+            low[model.jnt_dofadr[joint]], high[model.jnt_dofadr[joint]] = model.jnt_range[joint]
+    force_low, force_high = force_limits(model)
+    if force is not None:
+        force_high = _limit(model, "force", force)
+        force_low = -force_high
+    if not current > 0:
+        raise PantographError(f"the battery's current must be positive, got {current!r}")
+    return Machine(
+        Nominal(model),
+        low,
+        high,
+        _limit(model, "velocity", velocity),
+        _limit(model, "acceleration", acceleration),
+        _limit(model, "jerk", jerk),
+        force_low,
+        force_high,
+        _limit(model, "top_speed", top_speed),
+        np.zeros(model.nv) if ampere is None else per_joint(model, "ampere", ampere),
+        float(current),
+        np.ones(model.nv, dtype=bool) if driven is None else np.asarray(driven, dtype=bool),
+    )
+
+
+def _limit(model: mujoco.MjModel, what: str, value: Limit) -> Array:
+    if value is None:
+        return np.full(model.nv, np.inf)
+    if isinstance(value, int | float) and value == np.inf:
+        return np.full(model.nv, np.inf)
+    given = per_joint(model, what, value)
+    named = per_joint(model, what, dict.fromkeys(value, 1.0) if isinstance(value, Mapping) else 1.0) > 0
+    if (given[named] <= 0).any():
+        raise PantographError(f"a limit of {what} must be positive")
+    return np.where(named, given, np.inf)

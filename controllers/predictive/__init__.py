@@ -1,0 +1,1 @@
+"""Control by prediction: linear and nonlinear, warm-started from one sample to the next."""

@@ -1,0 +1,203 @@
+"""Motion against machines: what is impossible is found, and retimed motion is possible and the fastest."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pantograph.controllers.fit import check, machine, retime
+from pantograph.controllers.fit.check import forces
+from pantograph.models import load_model
+from pantograph.sim import PantographError
+from pantograph.sim.clip import Clip, Motion
+from pantograph.sim.curves import keyed
+from scipy.optimize import linprog
+from strategies import seeds
+
+NAMES = ("shoulder", "elbow")
+ARM = load_model("planar_2r")
+
+
+def arm_clip(seed, *, kind="natural", seconds=2.0, keys=4, size=1.0):
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, seconds, keys)
+    return Clip(ARM, {n: keyed(t, size * rng.uniform(-1, 1, keys), kind=kind) for n in NAMES}, ARM.qpos0)
+
+
+def line(distance, seconds=1.0):
+    return Clip(ARM, {"shoulder": keyed([0, seconds], [0, distance], kind="linear")}, ARM.qpos0)
+
+
+@given(st.floats(0.05, 2.5), st.floats(0.2, 5), st.floats(0.5, 20), st.floats(0.3, 3))
+def test_a_straight_way_takes_the_time_of_the_trapezoid(d, v, a, seconds):
+    able = machine(ARM, velocity=v, acceleration=a, force=np.inf)
+    found = retime(line(d, seconds), able, points=400)
+    closed = 2 * np.sqrt(d / a) if d <= v * v / a else d / v + v / a
+    piece = d / 400 / min(v, np.sqrt(a * d))  # the switch falls between points: about a piece's time is lost
+    assert closed * (1 - 1e-9) <= found.duration <= closed + piece
+    assert found.report.possible
+
+
+@given(seeds, st.sampled_from(["natural", "clamped", "auto", "linear"]))
+@settings(max_examples=30)
+def test_limits_hold_between_the_points_of_the_grid_too(seed, kind):
+    """By MuJoCo's inverse dynamics and plain differences on a grid of its own."""
+    top = 12.0
+    able = machine(
+        ARM, velocity=2.0, acceleration=9.0, force={"shoulder": 90.0, "elbow": 25.0}, top_speed=top
+    )
+    clip = arm_clip(seed, kind=kind)
+    found = retime(clip, able, points=300)
+    t = np.linspace(0, found.duration, 7001)
+    q, v, a = found.clip.evaluate(t)
+    data = mujoco.MjData(ARM)
+    tau = np.empty_like(v)
+    for i in range(0, len(t), 7):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[i], v[i], a[i]
+        mujoco.mj_inverse(ARM, data)
+        tau[i] = data.qfrc_inverse
+    limit = np.array([90.0, 25.0]) * (1 - np.maximum(np.sign(tau[::7]) * v[::7], 0) / top)
+    assert (np.abs(tau[::7]) <= limit * (1 + 1e-4)).all()
+    assert np.abs(v).max() <= 2.0 * (1 + 1e-6)
+    assert np.abs(a).max() <= 9.0 * (1 + 2e-4)
+    h = np.diff(t)[0]
+    np.testing.assert_allclose(np.diff(q, axis=0) / h, 0.5 * (v[1:] + v[:-1]), atol=9.0 * h)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_no_timing_is_faster(seed):
+    """The largest profile on the grid is the solution of one linear program, here by HiGHS."""
+    clip, n = arm_clip(seed, keys=3), 40
+    able = machine(ARM, velocity=2.0, acceleration=9.0, force=np.inf)
+    found = retime(clip, able, points=n)
+    s = found.s
+    h, n = np.diff(s), len(s) - 1
+    first, last = clip.evaluate(s[:-1]), clip.evaluate(s[1:], left=True)
+    rows, bound = [], []
+    for i in range(n):  # u_i = (x_{i+1} - x_i) / 2h
+        for motion, k in ((first, i), (last, i + 1)):
+            for dof in range(2):
+                row = np.zeros(n + 1)
+                row[i], row[i + 1] = -motion.v[i, dof] / (2 * h[i]), motion.v[i, dof] / (2 * h[i])
+                row[k] += motion.a[i, dof]
+                rows += [row, -row]
+                bound += [9.0, 9.0]
+    at = clip.evaluate(s)
+    cap = np.min((2.0 / np.maximum(np.abs(at.v), 1e-12)) ** 2, axis=1)
+    cap[0] = cap[-1] = 0.0
+    lp = linprog(
+        -np.ones(n + 1), np.array(rows), np.array(bound), bounds=list(zip(np.zeros(n + 1), cap, strict=True))
+    )
+    rate = np.sqrt(np.maximum(lp.x, 0.0))
+    best = float(np.sum(2 * h / (rate[1:] + rate[:-1])))
+    slowed = found.t[-1] / best
+    assert slowed == pytest.approx(1.0, abs=2e-2)
+    raw = np.diff(found.t) / slowed
+    assert np.abs(raw - 2 * h / (rate[1:] + rate[:-1])).max() <= 1e-3 * best  # HiGHS: x to 1e-7
+
+
+@given(seeds, st.floats(0.2, 3))
+@settings(max_examples=15)
+def test_the_nearest_timing_is_the_keyed_one_where_that_is_possible(seed, speed):
+    clip = arm_clip(seed, kind="clamped")
+    able = machine(ARM, velocity=speed, acceleration=30.0, force=np.inf)
+    found = retime(clip, able, keep=True, points=300)
+    rate = np.diff(found.s) / np.diff(found.t)
+    assert rate.max() <= 1.0 + 1e-9
+    if check(clip, able).possible:
+        assert found.duration == pytest.approx(2.0, rel=1e-6)
+        t = np.linspace(0, 2, 101)
+        np.testing.assert_allclose(found.clip.evaluate(t).q, clip.evaluate(t).q, atol=1e-6)
+    else:
+        assert found.duration > 2.0
+        assert found.report.possible
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_the_path_stays_the_same(seed):
+    clip = arm_clip(seed)
+    found = retime(clip, machine(ARM, velocity=1.0, acceleration=5.0, force=np.inf), points=200)
+    fine = np.linspace(0, found.duration, 5000)
+    way = clip.evaluate(np.linspace(0, 2, 4001)).q
+    for q in found.clip.evaluate(fine[::250]).q:
+        assert np.abs(way - q).max(axis=1).min() < 2e-3
+    ends = found.clip.evaluate([0.0, found.duration]).q
+    np.testing.assert_allclose(ends, clip.evaluate([0.0, 2.0]).q, atol=1e-9)
+    q, v, a = found.clip.evaluate(fine)
+    inner = np.ones(len(fine), dtype=bool)
+    for knot in found.t:
+        inner &= np.abs(fine - knot) > 1e-6
+    h = 1e-6
+    ahead, behind = (
+        found.clip.evaluate(fine[inner][1:-1] + h / 2),
+        found.clip.evaluate(fine[inner][1:-1] - h / 2),
+    )
+    np.testing.assert_allclose((ahead.q - behind.q) / h, v[inner][1:-1], atol=1e-4)
+    np.testing.assert_allclose((ahead.v - behind.v) / h, a[inner][1:-1], atol=1e-3)
+
+
+def test_a_battery_bounds_the_sum_of_currents():
+    clip, ampere = arm_clip(3), {"shoulder": 0.1, "elbow": 0.2}
+    free = retime(clip, machine(ARM, velocity=3.0), points=200)
+    tight = machine(ARM, velocity=3.0, ampere=ampere, current=9.0)
+    found = retime(clip, tight, points=200)
+    assert found.duration > free.duration
+    tau = forces(found.clip.evaluate(np.linspace(0, found.duration, 3001)), tight)
+    assert np.abs(tau) @ [0.1, 0.2] == pytest.approx(9.0, abs=9.1)
+    assert (np.abs(tau) @ np.array([0.1, 0.2])).max() <= 9.0 * (1 + 1e-4)
+
+
+def test_pauses_keep_their_length():
+    clip = Clip(ARM, {"shoulder": keyed([0, 1, 2, 3], [0, 1, 1, 0], kind="auto")}, ARM.qpos0)
+    found = retime(clip, machine(ARM, velocity=50.0, acceleration=200.0, force=np.inf), points=300)
+    at = np.interp([1.0, 2.0], found.s, found.t)
+    assert at[1] - at[0] == pytest.approx(1.0, rel=1e-2)
+    assert found.duration < 1.6
+
+
+def test_check_says_where_and_by_how_much():
+    """A sine-like clamped move of known peaks: q from 0 to 1 in 1 s, peak speed 1.5, end acceleration 6."""
+    clip = Clip(ARM, {"elbow": keyed([0, 1], [0.0, 1.0], kind="clamped")}, ARM.qpos0)
+    able = machine(ARM, velocity=1.2, acceleration=5.0, jerk=20.0, force=np.inf)
+    report = check(clip, able, points=5001)
+    found = {v.kind: v for v in report.violations}
+    assert found["velocity"].share == pytest.approx(1.5 / 1.2, rel=1e-6)
+    assert found["velocity"].t == pytest.approx(0.5, abs=1e-3)
+    cross = 0.5 - np.sqrt(0.25 - 1.2 / 6)  # 6 t (1 - t) = 1.2
+    assert found["velocity"].start == pytest.approx(cross, abs=1e-3)
+    assert found["velocity"].stop == pytest.approx(1 - cross, abs=1e-3)
+    assert found["acceleration"].share == pytest.approx(6 / 5, rel=1e-3)
+    assert "acceleration" in str(found["acceleration"])
+    assert not report.possible
+    assert check(clip, machine(ARM, velocity=1.6, acceleration=6.1, force=np.inf)).possible
+    far = Clip(ARM, {"elbow": keyed([0, 1], [0.0, 3.1], kind="clamped")}, ARM.qpos0)
+    beyond = check(far, machine(ARM)).violations
+    position = next(v for v in beyond if v.kind == "position")
+    assert position.value == pytest.approx(0.3, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("clip", "limits", "words"),
+    [
+        (line(1.0), {"force": 1.0}, "joint 'shoulder' cannot hold the pose at 0.000 s"),
+        (line(3.5), {"velocity": 1.0}, "no timing helps: shoulder: position 0.4"),
+        (arm_clip(0, kind="step"), {"velocity": 1.0}, "the path jumps at"),
+        (line(1.0), {"jerk": 5.0}, "does not bound jerk"),
+        (line(1.0), {"velocity": {"sholder": 1.0}}, "did you mean 'shoulder'"),
+        (line(1.0), {"velocity": -1.0}, "must be a number >= 0"),
+        (line(1.0), {"velocity": 0.0}, "must be positive"),
+        (line(1.0), {"driven": np.array([True, False])}, "needs a drive at every"),
+    ],
+)
+def test_what_cannot_be_helped_is_said(clip, limits, words):
+    with pytest.raises(PantographError, match=words):
+        retime(clip, machine(ARM, **limits))
+
+
+def test_forces_are_those_of_one_state():
+    able, rng = machine(ARM), np.random.default_rng(1)
+    motion = Motion(*rng.normal(size=(3, 5, 2)))
+    one = [able.nominal.inverse(*row) for row in zip(*motion, strict=True)]
+    np.testing.assert_allclose(forces(motion, able), one)
