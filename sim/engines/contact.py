@@ -12,6 +12,7 @@ import numpy as np
 from ...models import captured_warnings
 from ..errors import EngineError
 from ..kinds import BALL, FREE
+from .common import fastest_joint, joint_of_largest, recorded, steps_per_tick
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
@@ -27,7 +28,7 @@ INTEGRATORS = {
 ORDER = {"euler": 1, "rk4": 4, "implicit": 1, "implicitfast": 1, "discrete": 1}
 
 _CHUNK = 1024  # steps whose prescribed inputs are evaluated at once
-_HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) for a state that makes sense
+_BLOWN_UP = (mujoco.mjtWarning.mjWARN_BADQACC, mujoco.mjtWarning.mjWARN_BADQPOS)
 
 
 class ContactEngine:
@@ -65,11 +66,7 @@ class _Run:
         self.problem, self.controls, self.t0 = problem, controls, t_span[0]
         self.h = problem.step
         self.steps = round((t_span[1] - t_span[0]) / self.h)
-        self.per_tick = round(controls.period / self.h) if controls else 0
-        if controls and abs(self.per_tick * self.h - controls.period) > 1e-9 * controls.period:
-            raise EngineError(
-                f"the controller's period {controls.period:g} s is no whole multiple of the step {self.h:g} s"
-            )
+        self.per_tick = steps_per_tick(controls, self.h)
         self.prescriber = Prescriber(problem.model, problem.dofs(Role.KEYED))
         self.model = self.prescriber.model
         self.model.opt.timestep = self.h
@@ -247,14 +244,11 @@ class _Run:
     def _nonsense(self, k: int) -> str:
         """Why the state at step ``k`` makes no sense, or an empty string."""
         d, m = self.data, self.model
-        bad = ~np.isfinite(d.qvel) | (np.abs(d.qvel) > _HUGE)
-        warned = any(
-            d.warning[w].number for w in (mujoco.mjtWarning.mjWARN_BADQACC, mujoco.mjtWarning.mjWARN_BADQPOS)
-        )
-        if not bad.any() and np.isfinite(d.qpos).all() and not warned:
+        joint = fastest_joint(m, d.qpos, d.qvel)
+        if any(d.warning[int(w)].number for w in _BLOWN_UP):
+            joint = joint_of_largest(m, np.abs(d.qacc))
+        if joint is None:
             return ""
-        speed = np.where(np.isfinite(d.qvel), np.abs(d.qvel), np.inf)
-        joint = m.joint(int(m.dof_jntid[int(np.argmax(speed))])).name or "an unnamed joint"
         return (
             f"diverged at t = {self.t0 + k * self.h:.4g} s at joint {joint!r}: "
             f"with {self.problem.integrator} and a step of {self.h:g} s {self._cause()}"
@@ -272,11 +266,6 @@ class _Run:
         return "the motion is too fast for the step; try a smaller one, or check forces and initial state"
 
     def _result(self, status: str, message: str, k: int, wall: float) -> Segment:
-        if status == "diverged":
-            self.samples = [
-                s for s in self.samples if np.isfinite(s[1].q).all() and np.isfinite(s[1].v).all()
-            ]
-        m = self.model
         stats: dict[str, Any] = {
             "engine": "contact",
             "integrator": self.problem.integrator,
@@ -286,21 +275,8 @@ class _Run:
             "wall_s": wall,
         }
         return Segment(
-            t=np.array([t for t, _ in self.samples]),
-            q=_rows([s.q for _, s in self.samples], m.nq),
-            v=_rows([s.v for _, s in self.samples], m.nv),
-            act=_rows([s.act for _, s in self.samples], m.na),
-            tick_t=np.array([t for t, _ in self.ticks]),
-            tick_ctrl=_rows([u.ctrl for _, u in self.ticks], m.nu),
-            tick_qfrc=_rows([u.qfrc for _, u in self.ticks], m.nv),
-            status=status,
-            message=message,
-            stats=stats,
+            **recorded(self.model, self.samples, self.ticks), status=status, message=message, stats=stats
         )
-
-
-def _rows(rows: list[Array], width: int) -> Array:
-    return np.array(rows, dtype=float).reshape(len(rows), width)
 
 
 def _quaternion_joints(model: mujoco.MjModel) -> tuple[Array, Array, list[int], list[int]]:

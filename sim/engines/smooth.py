@@ -12,6 +12,7 @@ import numpy as np
 
 from ...models import name_of
 from ..errors import EngineError
+from .common import HUGE, fastest_joint, recorded, rows, steps_per_tick
 from .compiled import CHUNK, Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
 from .limits import Limit, limits_of
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from ..integrate import Tableau
 
 RESTITUTION = 0.0  # a joint that meets its limit stops there; servo arms do not bounce
-_HUGE = 1e10
 
 
 def methods() -> dict[str, int]:
@@ -101,11 +101,7 @@ class _Run:
         self.problem, self.controls, self.method, self.t0 = problem, controls, method, t_span[0]
         self.h = problem.step
         self.steps = round((t_span[1] - t_span[0]) / self.h)
-        self.per_tick = round(controls.period / self.h) if controls else 0
-        if controls and abs(self.per_tick * self.h - controls.period) > 1e-9 * controls.period:
-            raise EngineError(
-                f"the controller's period {controls.period:g} s is no whole multiple of the step {self.h:g} s"
-            )
+        self.per_tick = steps_per_tick(controls, self.h)
         self.timed = Timed(problem)
         self.limits = limits_of(problem)
         self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
@@ -340,12 +336,9 @@ class _Run:
         self.events.append(Event(self.t0 + offset, kind, name))
 
     def _nonsense(self, k: int) -> str:
-        bad = ~np.isfinite(self.v) | (np.abs(self.v) > _HUGE)
-        if not bad.any() and np.isfinite(self.q).all():
+        joint = fastest_joint(self.problem.model, self.q, self.v)
+        if joint is None:
             return ""
-        speed = np.where(np.isfinite(self.v), np.abs(self.v), np.inf)
-        m = self.problem.model
-        joint = name_of(m, "joint", int(m.dof_jntid[int(np.argmax(speed))]))
         return (
             f"diverged before t = {self.t0 + k * self.h:.4g} s at joint {joint!r}: with "
             f"{self.problem.integrator} and a step of {self.h:g} s the motion is too fast or too stiff; "
@@ -377,18 +370,12 @@ class _Run:
     def _result(self, status: str, message: str, k: int, wall: float) -> Segment:
         m = self.problem.model
         kept = [
-            (t, s) for t, s in self.samples if np.isfinite(s.q).all() and np.abs(s.v).max(initial=0) < _HUGE
+            (t, s) for t, s in self.samples if np.isfinite(s.q).all() and np.abs(s.v).max(initial=0) < HUGE
         ]
         a, drive = self._accelerations(kept)
         builds = [c.smooth.stats for c in self.compiled.values()]
         return Segment(
-            t=np.array([t for t, _ in kept]),
-            q=rows([s.q for _, s in kept], m.nq),
-            v=rows([s.v for _, s in kept], m.nv),
-            act=rows([s.act for _, s in kept], m.na),
-            tick_t=np.array([t for t, _ in self.ticks]),
-            tick_ctrl=rows([u.ctrl for _, u in self.ticks], m.nu),
-            tick_qfrc=rows([u.qfrc for _, u in self.ticks], m.nv),
+            **recorded(m, kept, self.ticks),
             status=status,
             message=message,
             stats={
@@ -418,8 +405,3 @@ def mobility(problem: Problem) -> Array:
     inverse = np.eye(m.nv)
     mujoco.mj_solveM(m, data, inverse, np.eye(m.nv))
     return np.diag(inverse).copy()
-
-
-def rows(values: list[Array], width: int) -> Array:
-    """Arrays (width,) as rows, also when there are none."""
-    return np.array(values, dtype=float).reshape(len(values), width)

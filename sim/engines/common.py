@@ -1,0 +1,71 @@
+"""What engines with a loop of their own share."""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+import mujoco
+import numpy as np
+
+from ...models import name_of
+from ..errors import EngineError
+from .interface import Array, Controls, Held, State
+
+HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) for a state that makes sense
+
+
+def steps_per_tick(controls: Controls | None, step: float) -> int:
+    """Whole steps in a controller's period; 0 without one. Raises EngineError when they do not fit."""
+    if controls is None:
+        return 0
+    steps = round(controls.period / step)
+    if abs(steps * step - controls.period) > 1e-9 * controls.period:
+        raise EngineError(
+            f"the controller's period {controls.period:g} s is no whole multiple of the step {step:g} s"
+        )
+    return steps
+
+
+def fastest_joint(model: mujoco.MjModel, q: Array, v: Array) -> str | None:
+    """Name of the fastest joint when the state makes no sense any more, else None."""
+    speed = np.where(np.isfinite(v), np.abs(v), np.inf)
+    if np.isfinite(q).all() and np.all(speed <= HUGE):
+        return None
+    return joint_of_largest(model, speed)
+
+
+def joint_of_largest(model: mujoco.MjModel, speed: Array) -> str:
+    """Name of the joint whose freedom has the largest of ``speed`` (nv,)."""
+    return name_of(model, "joint", int(model.dof_jntid[int(np.argmax(speed))]))
+
+
+def rows(values: list[Array], width: int) -> Array:
+    """Arrays (width,) as rows, also when there are none."""
+    return np.array(values, dtype=float).reshape(len(values), width)
+
+
+class Recorded(TypedDict):
+    """The arrays of a Segment."""
+
+    t: Array
+    q: Array
+    v: Array
+    act: Array
+    tick_t: Array
+    tick_ctrl: Array
+    tick_qfrc: Array
+
+
+def recorded(
+    model: mujoco.MjModel, samples: list[tuple[float, State]], ticks: list[tuple[float, Held]]
+) -> Recorded:
+    """The arrays of a Segment from its samples and the controller's ticks."""
+    return {
+        "t": np.array([t for t, _ in samples]),
+        "q": rows([s.q for _, s in samples], model.nq),
+        "v": rows([s.v for _, s in samples], model.nv),
+        "act": rows([s.act for _, s in samples], model.na),
+        "tick_t": np.array([t for t, _ in ticks]),
+        "tick_ctrl": rows([u.ctrl for _, u in ticks], model.nu),
+        "tick_qfrc": rows([u.qfrc for _, u in ticks], model.nv),
+    }
