@@ -562,6 +562,8 @@ def test_shapes_that_do_not_fit_are_named():
     [
         (("</worldbody>", "</worldbody><equality><joint joint1='a' joint2='b'/></equality>"), "closed loops"),
         (('<motor joint="b"/>', "<muscle joint='b' lengthrange='0 1'/>"), "muscle"),
+        (('<motor joint="b"/>', "<motor joint='b' armature='0.1'/>"), "given at the actuator"),
+        (('<motor joint="b"/>', "<motor joint='b' damping='0.1'/>"), "given at the actuator"),
         (('<motor joint="b"/>', "<motor site='s'/>"), "transmission site"),
         (('<motor joint="b"/>', "<position joint='b' kp='1' delay='0.1' nsample='10'/>"), "delay"),
         (('<motor joint="b"/>', "<intvelocity joint='b' kp='1' actrange='-1 1'/>"), "actlimited"),

@@ -72,6 +72,8 @@ def _joint(model: mujoco.MjModel, joint: int, keyed: Collection[int]) -> list[st
             found.append("armature that differs between the axes of a free joint")
     if model.jnt_actgravcomp[joint] and model.jnt_actfrclimited[joint]:
         found.append("gravity compensation within actuator force limits (actuatorgravcomp)")
+    if model.jnt_actuatorid[joint] >= 0:
+        found.append("damping or armature given at the actuator: give it at the joint")
     return found
 
 
