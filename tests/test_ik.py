@@ -75,7 +75,8 @@ def test_jacobians_of_goals_are_their_derivatives(model, seed):
     a, b = (f"s{k}" for k in rng.integers(0, model.nsite, 2))
     x, y, quat = rng.normal(size=3), rng.normal(size=3), rng.normal(size=4)
     goals = [
-        Position(a, x), Position(a, x, relative_to=b), Orientation(a, quat), Pose(a, x, quat, relative_to="s0"),
+        Position(a, x), Position(a, x, relative_to=b), Orientation(a, quat),
+        Pose(a, x, quat, relative_to="s0"),
         LookAt(a, 5 * x, axis=y), PointOnLine(a, x, y), PointOnPlane(a, x, y), Distance(a, 3 * x, 1.0),
         Posture(model.qpos0), Mirror(a, "s0", y, x, relative_to=b), Pole(a, "s0", b, x),
     ]  # fmt: skip
@@ -155,7 +156,7 @@ def test_near_means_nearest_to_the_start():
     lengths = (1.0, 0.8)
     model = ik_cases.planar_chain(lengths)
     for truth in ik_planar.two_links(lengths, (0.9, 0.7)):
-        solution = solve(model, Position("tip", [0.9, 0.7, 0]), q0=truth + [0.2, -0.1])
+        solution = solve(model, Position("tip", [0.9, 0.7, 0]), q0=np.add(truth, [0.2, -0.1]))
         np.testing.assert_allclose(solution.q, truth, atol=1e-9)
 
 
@@ -190,7 +191,7 @@ def test_pinned_feet_and_the_centre_of_mass_of_a_free_puppet():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     feet = [Position(f"{side}_foot", data.site(f"{side}_foot").xpos.copy()) for side in ("left", "right")]
-    hand = data.site("left_hand").xpos + [0.12, 0.02, 0.1]
+    hand = np.add(data.site("left_hand").xpos, [0.12, 0.02, 0.1])
     middle = 0.5 * (feet[0].target + feet[1].target)
     com = CenterOfMass([middle[0], middle[1], 0.0], tolerance=(1e-6, 1e-6, np.inf))
     solution = solve(model, [*feet, Position("left_hand", hand), com])
@@ -205,7 +206,7 @@ def test_mirror_line_plane_and_sight():
     model = load_model("puppet")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    hand, seen = data.site("right_hand").xpos + [0.15, -0.05, 0.2], np.array([1.0, -0.3, 0.8])
+    hand, seen = np.add(data.site("right_hand").xpos, [0.15, -0.05, 0.2]), np.array([1.0, -0.3, 0.8])
     goals = [Position("right_hand", hand), Mirror("left_hand", "right_hand"),
              LookAt("gaze", seen, axis=(1, 0, 0), tolerance=1e-5)]  # fmt: skip
     joints = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name != "root"]
@@ -233,7 +234,9 @@ def test_all_lists_every_solution_of_a_wrist_arm():
     p, quat = ik_cases.pose_of(model, q, "tip")
     found = solve(model, Pose("tip", p, quat), all=True).solutions
     assert any(np.allclose(x, q, atol=1e-6) for x in found)
-    flipped = q + [0, 0, 0, np.pi * (-1 if q[3] > 0 else 1), -2 * q[4], np.pi]  # the wrist's other solution
+    flipped = np.add(
+        q, [0, 0, 0, np.pi * (-1 if q[3] > 0 else 1), -2 * q[4], np.pi]
+    )  # the wrist's other solution
     assert any(np.allclose(ik_planar.wrap(x - flipped), 0, atol=1e-6) for x in found)
     for x in found:
         np.testing.assert_allclose(ik_cases.pose_of(model, x, "tip")[0], p, atol=1e-9)

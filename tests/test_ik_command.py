@@ -30,7 +30,7 @@ def test_a_negative_verdict_fails_and_tells_the_distance():
 
 def test_the_way_can_be_pictured(tmp_path):
     pytest.importorskip("pyrender")
-    code, text = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
+    code, _ = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
     assert code == 0
     assert (tmp_path / "pose.png").stat().st_size > 1000
 

@@ -1,4 +1,4 @@
-"""Closed loops: a four-bar against its closed form, a Stewart platform, coupled joints, redundant equations."""
+"""Closed loops: a four-bar against its closed form, a Stewart platform, coupled joints, welds."""
 
 import mujoco
 import numpy as np
@@ -80,7 +80,7 @@ def test_the_projection_is_nearest_in_the_metric_of_the_mass_matrix():
     along = loops.tangent(q, v, metric=M)
     J = loops.rows(q[None]).J[0]
     np.testing.assert_allclose(J @ along, 0, atol=1e-12)
-    closed = loops.project(q + [0, 1e-6, 0], metric=M, held=[True, False, False])
+    closed = loops.project(np.add(q, [0, 1e-6, 0]), metric=M, held=[True, False, False])
     assert closed.q[0] == q[0] and closed.open < 1e-12
     free = np.linalg.svd(J)[2][-1]  # a four-bar has one freedom
     assert free @ M @ (along - v) == pytest.approx(0, abs=1e-12)
@@ -117,7 +117,8 @@ def test_welds_hold_pose_and_bodies():
     <mujoco><worldbody>
       <body name="a"><joint type="free"/><geom size=".1" mass="1"/></body>
       <body name="b" pos="1 0 0"><joint name="h" axis="0 0 1"/><geom size=".1" mass="1"/></body>
-    </worldbody><equality><weld body1="a" body2="b" anchor="0.1 0.2 0.3" relpose="0.3 0 0 0.8 0.6 0 0"/></equality>
+    </worldbody><equality>
+      <weld body1="a" body2="b" anchor="0.1 0.2 0.3" relpose="0.3 0 0 0.8 0.6 0 0"/></equality>
     </mujoco>""")
     q = model.qpos0.copy()
     q[7] = 0.8

@@ -1,4 +1,4 @@
-"""Inverse kinematics along time: limits, singularities, deviations told, clearance, and animators' constraints."""
+"""Inverse kinematics along time: limits, singularities, deviations, clearance, animators' constraints."""
 
 import mujoco
 import numpy as np
@@ -61,7 +61,9 @@ def test_an_easy_path_is_followed_exactly():
     q = np.array([0.3, 0.4, 0.5, 0.1, 0.6, 0.2])
     p, quat = ik_cases.pose_of(model, q, "tip")
     times = np.arange(0, 2, 0.05)
-    motion = follow(model, lambda t: [Pose("tip", p + [0, 0.05 * np.sin(3 * t), 0], quat)], times, q0=q)
+    motion = follow(
+        model, lambda t: [Pose("tip", np.add(p, [0, 0.05 * np.sin(3 * t), 0]), quat)], times, q0=q
+    )
     assert motion.followed and motion.missed == ()
     assert motion.position.max() < 1e-6 and motion.rotation.max() < 1e-6
 
@@ -176,9 +178,10 @@ def test_banded_programmes_agree_with_an_independent_solver(seed):
     for d in range(1, 2 * n + 1):
         dense += np.diag(H.bands[d, :-d], d) + np.diag(H.bands[d, :-d], -d)
     g = 20 * rng.normal(size=(k, n))
+    bounds = np.full((k - 2, n), -0.05), np.full((k - 2, n), 0.05)
     sets = [((1.0,), np.full((k, n), -0.5), np.full((k, n), 0.5), np.full(n, 0.5)),
             ((-1.0, 1.0), np.full((k - 1, n), -0.1), np.full((k - 1, n), 0.1), np.full(n, 0.1)),
-            ((1.0, -2.0, 1.0), np.full((k - 2, n), -0.05), np.full((k - 2, n), 0.05), np.full(n, 0.05))]  # fmt: skip
+            ((1.0, -2.0, 1.0), *bounds, np.full(n, 0.05))]  # fmt: skip
     x = _interior(H, g, sets)
 
     def walls(y):

@@ -9,7 +9,12 @@ from pantograph.sim.scene.goals import deviations
 
 
 def _scene(**words):
-    goal = {"at": "tip", "times": [0, 1], "position": [[0.45, -0.1, 0.4], [0.45, 0.1, 0.5]], "curve": "clamped"}
+    goal = {
+        "at": "tip",
+        "times": [0, 1],
+        "position": [[0.45, -0.1, 0.4], [0.45, 0.1, 0.5]],
+        "curve": "clamped",
+    }
     base = {"duration": 1.0, "models": [{"file": "arm6"}], "goals": [goal | words.pop("goal", {})]}
     return Scene(**(base | words))
 

@@ -65,7 +65,7 @@ def _goal(model: Any, site: str | None, to: str) -> Goal:
     from ...models import names_of
     from ..ik import Pose, Position
 
-    sites = [name for name in names_of(model, "site")]
+    sites = names_of(model, "site")
     if site is None:
         if len(sites) != 1:
             raise PantographError(

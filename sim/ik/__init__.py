@@ -7,7 +7,6 @@ out of reach
 """
 
 from .animate import Locked, Pole, Spread, blend, lock, soften
-from .stream import Follower, Tick
 from .goals import (
     CenterOfMass,
     Distance,
@@ -25,6 +24,7 @@ from .goals import (
 from .loops import Loops, Projection
 from .raced import ChainSolver
 from .solve import solve
+from .stream import Follower, Tick
 from .track import Motion, follow
 from .verdict import Residual, Solution, Verdict
 

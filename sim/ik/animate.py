@@ -1,10 +1,11 @@
 # ruff: noqa: D102  (overridden methods are documented by Goal)
-"""What animators ask for on top of goals: pole vectors, soft reach, spread spines, locked feet, FK/IK blends."""
+"""What animators ask for on top of goals: poles, soft reach, spread spines, locked feet, FK/IK blends."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -18,7 +19,7 @@ from ..kinds import BALL, SCALAR
 from .descend import descend, tighten
 from .goals import Goal, Pose, Position, Rows, Unit, vector
 from .pose import Configurations, Kinematics, Moving
-from .preferences import Wishes, preference
+from .preferences import preference, wishes
 from .problem import Problem
 from .settle import settle
 from .space import Space
@@ -54,7 +55,7 @@ class Pole(Goal):
         root, mid, tip = (c.frame(name) for name in self.frames())
         A, dA = _unit(tip.p - root.p, tip.Jv - root.Jv)
         m, dm = _across(mid.p - root.p, mid.Jv - root.Jv, A, dA)
-        w, dw = _across(self.pole - root.p, -root.Jv, A, dA)
+        w, dw = _across(np.asarray(self.pole) - root.p, -root.Jv, A, dA)
         w, dw = _unit(w, dw)
         u, _ = _unit(m, dm)
         long = np.linalg.norm(m, axis=1)
@@ -98,7 +99,8 @@ class Spread(Goal):
 
     def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         kinds = {int(model.jnt_type[lookup(model, "joint", name)]) for name in self.joints}
-        return ("rad",) * ((len(self.joints) - 1) * (3 if kinds == {BALL} else 1))
+        unit: Unit = "rad"
+        return (unit,) * ((len(self.joints) - 1) * (3 if kinds == {BALL} else 1))
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         model = kinematics.model
@@ -114,8 +116,8 @@ class Spread(Goal):
             raise ModelError(f"{self.label}: joints of different kinds share nothing")
         shares = shares / shares.sum()
         scaled = [(r / s, J / s) for (r, J), s in zip(parts, shares, strict=True)]
-        r = [b[0] - a[0] for a, b in zip(scaled, scaled[1:], strict=False)]
-        J = [b[1] - a[1] for a, b in zip(scaled, scaled[1:], strict=False)]
+        r = [b[0] - a[0] for a, b in pairwise(scaled)]
+        J = [b[1] - a[1] for a, b in pairwise(scaled)]
         return Rows(np.concatenate(r, axis=1), np.concatenate(J, axis=1))
 
 
@@ -176,7 +178,7 @@ def blend(
 class Locked(NamedTuple):
     """A motion with locked frames.
 
-    q (k, nq); `slip` (k,) [m]: how far a locked frame is from its place; `met` (k,): all locks and blends held.
+    q (k, nq); `slip` (k,) [m]: how far a locked frame is from its place; `met` (k,): all was held.
     """
 
     q: Array
@@ -232,14 +234,14 @@ def lock(
 
 
 def _stood(problem: Problem, poses: Problem, starts: Array, q: Array) -> Array:
-    """Frames at their places, first of all; turned as in `poses` and near the motion q (nq,) as that allows."""
+    """Frames at their places, first of all; turned as in `poses` and near q (nq,) as that allows."""
     ends = descend(problem, descend(poses, starts).q)
     if not ends.met.any():
         return np.asarray(ends.q[int(np.argmin(ends.cost))])
     near = preference("near", problem, q)
     away = np.array([np.sum(near(x[None]).r ** 2) for x in ends.q])
     best = int(np.argmin(np.where(ends.met, away, np.inf)))
-    return tighten(problem, settle(problem, ends.q[best], Wishes(poses, near), iterations=20).q)
+    return tighten(problem, settle(problem, ends.q[best], wishes(poses, near), iterations=20).q)
 
 
 class _Stance(NamedTuple):

@@ -1,8 +1,8 @@
 """Turning about fixed axes: the sub-problems that closed forms are made of (Paden & Kahan; Pieper 1968).
 
 Joints are axes in the reference pose, where all turn by zero: points o_i and unit directions u_i in the
-world; the frame moves by exp(u_1, th_1) ... exp(u_n, th_n) (product of exponentials, Murray, Li & Sastry 1994,
-ch. 3).
+world; the frame moves by exp(u_1, th_1) ... exp(u_n, th_n) (product of exponentials; Murray, Li & Sastry
+1994, ch. 3).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def trig_roots(f: list[float] | Array) -> Roots:
     size = np.abs(quartic).max()
     if size < 1e-300:
         return Roots([], False)
-    scale = max(float(np.abs(f).max()), 1e-300)  # type: ignore[union-attr]
+    scale = max(float(np.abs(f).max()), 1e-300)
     while len(quartic) > 2 and abs(quartic[0]) < 1e-13 * size and abs(quartic[-1]) < 1e-13 * size:
         quartic = quartic[1:-1]
     if len(quartic) == 1 or size < 1e-12 * scale:
@@ -77,11 +77,9 @@ def trig_roots(f: list[float] | Array) -> Roots:
 
 
 def around(axis: Array, a: Array, b: Array) -> float | None:
-    """Angle about `axis` that turns a's direction onto b's, both seen along it; None when a is along it."""
+    """Angle about `axis` that turns a's direction onto b's, seen along it; None when one is along it."""
     pa, pb = a - (a @ axis) * axis, b - (b @ axis) * axis
-    if min(np.linalg.norm(pa), np.linalg.norm(pb)) < _FLAT * max(
-        np.linalg.norm(a), np.linalg.norm(b), 1e-300
-    ):
+    if min(float(pa @ pa), float(pb @ pb)) < _FLAT**2 * max(float(a @ a), float(b @ b), 1e-300):
         return None
     return float(np.arctan2(axis @ _cross(pa, pb), pa @ pb))
 
@@ -152,8 +150,8 @@ def point_by_three(axes: list[Axis], w: Array, target: Array) -> ThreeTurns:
     def residual(th3: float) -> float:
         x, y, _, P, Q = right(th3)
         if with_a and with_sine:
-            return ((P / a) ** 2 + (Q / sine) ** 2 - x * x - y * y) / size**2
-        return P / size**2 if with_sine else Q / size
+            return float(((P / a) ** 2 + (Q / sine) ** 2 - x * x - y * y) / size**2)
+        return float(P / size**2 if with_sine else Q / size)
 
     roots = trig_roots([residual(2 * np.pi * k / 5) for k in range(5)])
     out: list[tuple[float, float, float]] = []

@@ -143,7 +143,7 @@ def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
 
 
 def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
-    """q (nq,) after Gauss-Newton steps of least norm without damping, while these bring judged rows nearer."""
+    """q (nq,) after undamped Gauss-Newton steps of least norm, while these bring judged rows nearer."""
     x, columns = q[None], np.flatnonzero(problem.moved)
     w = problem.weighted(problem.raw(x))
     for _ in range(steps if len(columns) else 0):

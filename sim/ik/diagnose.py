@@ -1,4 +1,4 @@
-"""Why goals were not met: bounds and closed forms first, then searches with parts of the question left out."""
+"""Why goals were not met: bounds and closed forms, then searches with parts of the question left out."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _proved_held(problem: Problem, search: Search) -> bool:
         return True
     if closed_form_outside(problem, closed_form(problem, search.start)) is not None:
         return True
-    return subdivision(problem)
+    return subdivision(problem, search.start)
 
 
 def _sizes(problem: Problem, r: Array) -> tuple[float, float]:
@@ -146,7 +146,7 @@ def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal
         form = closed_form(alone, search.start)
         outside = closed_form_outside(alone.without_limits(), form)
         proved, by = outside is not None and not len(outside), form.structure if form is not None else ""
-    if not proved and subdivision(alone):
+    if not proved and subdivision(alone, search.start):
         proved, by = True, "subdivision of its joints' ranges"
     sure = search.agreed() >= 2 or proved
     reason = f"{goal.label} cannot come nearer than {_words(position, rotation)}"
@@ -168,10 +168,9 @@ def _apart(problem: Problem, search: Search, nearest: Descent | None) -> tuple[f
     if not isinstance(goal, Pose):
         end = nearest or _closest(problem, search)
         return (*_sizes(problem, end.r), end.q[0])
-    keep = {"at": goal.at, "relative_to": goal.relative_to}
     t = goal.tolerances()
-    place = problem.only([Position(target=goal.position, tolerance=tuple(t[:3]), **keep)])
-    turn = problem.only([Orientation(quat=goal.quat, tolerance=tuple(t[3:]), **keep)])
+    place = problem.only([Position(goal.at, goal.position, goal.relative_to, tolerance=tuple(t[:3]))])
+    turn = problem.only([Orientation(goal.at, goal.quat, goal.relative_to, tolerance=tuple(t[3:]))])
     placed, turned = _closest(place, search), _closest(turn, search)
     end = nearest or _closest(problem, search)
     if not placed.met[0] or not turned.met[0]:
@@ -181,9 +180,9 @@ def _apart(problem: Problem, search: Search, nearest: Descent | None) -> tuple[f
         if not placed.met[0] and not turned.met[0]:
             rotation = _sizes(turn, turned.r)[1]
         return position, rotation, end.q[0]
-    position = _least(turn, place, search, end)[0]
-    rotation, q = _least(place, turn, search, end)
-    return position, rotation, end.q[0] if q is None else end.q[0]
+    position = _least(turn, place, search, end)
+    rotation = _least(place, turn, search, end)
+    return position, rotation, end.q[0]
 
 
 def _closest(problem: Problem, search: Search) -> Descent:
@@ -197,7 +196,7 @@ def _closest(problem: Problem, search: Search) -> Descent:
     return min(ends, key=lambda end: float(end.cost[0]))
 
 
-def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> tuple[float, Array | None]:
+def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> float:
     """Least residual of `wanted` while `held` is met, from several starts: a number in its own unit."""
     starts = np.concatenate([end.q, search.best.q[:6]])
     feasible = descend(held, starts)
@@ -205,7 +204,7 @@ def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> tupl
     more = [feasible.q[feasible.met], part.more(24)]
     q = np.concatenate(more)
     if not len(q):
-        return 0.0, None
+        return 0.0
 
     def wish(x: Array) -> Rows:
         return wanted.weighted(wanted.raw(x))
@@ -214,7 +213,7 @@ def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> tupl
     ends = [settle(held, q[i], wish) for i in np.argsort(value)[:3]]
     best = min(ends, key=lambda e: e.value)
     position, rotation = _sizes(wanted, wanted.raw(best.q[None]).r)
-    return max(position, rotation), best.q
+    return max(position, rotation)
 
 
 def _conflict(
@@ -229,7 +228,7 @@ def _conflict(
         reason += f", {_words(gap.position, gap.rotation)} proved by {gap.by}"
     else:
         part = problem.only(goals)
-        proved = subdivision(part.without_limits())
+        proved = subdivision(part.without_limits(), search.start)
         reason += ", by subdivision of the joints' ranges" if proved else ""
     verdict = Verdict("conflict", proved, reason, position, rotation, gap.position, None, names)
     return Diagnosis(verdict, nearest=nearest.q[0])

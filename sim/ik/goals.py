@@ -153,7 +153,7 @@ class Position(Goal):
 
     def rows(self, c: Configurations) -> Rows:
         f = _seen_from(c, self.at, self.relative_to)
-        return Rows(f.p - self.target, f.Jv)
+        return Rows(f.p - np.asarray(self.target), f.Jv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,8 @@ class Pose(Goal):
         f = _seen_from(c, self.at, self.relative_to)
         turn = _turn_rows(f, self.back)
         return Rows(
-            np.concatenate([f.p - self.position, turn.r], axis=1), np.concatenate([f.Jv, turn.J], axis=1)
+            np.concatenate([f.p - np.asarray(self.position), turn.r], axis=1),
+            np.concatenate([f.Jv, turn.J], axis=1),
         )
 
 
@@ -250,7 +251,7 @@ class LookAt(Goal):
     def rows(self, c: Configurations) -> Rows:
         f = c.frame(self.at)
         a = f.R @ np.asarray(self.axis)
-        sight = self.target - f.p
+        sight = np.asarray(self.target) - f.p
         far = np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         d = sight / far
         Jd = -(f.Jv - d[:, :, None] * (d[:, None, :] @ f.Jv)) / far[:, :, None]
@@ -282,7 +283,7 @@ class PointOnLine(Goal):
     def rows(self, c: Configurations) -> Rows:
         f = c.frame(self.at)
         across = np.linalg.svd(np.asarray(self.direction)[None])[2][1:]  # two unit vectors across the line
-        return Rows((f.p - self.point) @ across.T, across @ f.Jv)
+        return Rows((f.p - np.asarray(self.point)) @ across.T, across @ f.Jv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +307,7 @@ class PointOnPlane(Goal):
 
     def rows(self, c: Configurations) -> Rows:
         f, n = c.frame(self.at), np.asarray(self.normal)
-        return Rows((f.p - self.point) @ n[:, None], n[None] @ f.Jv)
+        return Rows((f.p - np.asarray(self.point)) @ n[:, None], n[None] @ f.Jv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +372,7 @@ class CenterOfMass(Goal):
 
     def rows(self, c: Configurations) -> Rows:
         p, J = c.center_of_mass()
-        return Rows(p - self.target, J)
+        return Rows(p - np.asarray(self.target), J)
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,7 +430,8 @@ class Posture(Goal):
         return ("rad",)
 
     def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
-        return ("rad",) * int(model.nv)
+        unit: Unit = "rad"
+        return (unit,) * int(model.nv)
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         return np.ones(kinematics.model.nv, dtype=bool)
@@ -472,5 +474,5 @@ class Mirror(Goal):
         f, g = (_seen_from(c, at, self.relative_to) for at in (self.at, self.of))
         n = np.asarray(self.normal)
         S = np.eye(3) - 2 * np.outer(n, n)
-        image = (g.p - self.point) @ S + self.point
+        image = (g.p - np.asarray(self.point)) @ S + np.asarray(self.point)
         return Rows(f.p - image, f.Jv - S @ g.Jv)

@@ -108,8 +108,7 @@ def _meeting_frames(model: mujoco.MjModel, kinematics: Kinematics, e: int, data:
     one, two = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
     weld = int(model.eq_type[e]) == WELD
     if int(model.eq_objtype[e]) == int(mujoco.mjtObj.mjOBJ_SITE):
-        site = "site"
-        return name_of(model, site, one), name_of(model, site, two)
+        return name_of(model, "site", one), name_of(model, "site", two)
     if not weld:
         return kinematics.anchored(one, data[0:3]), kinematics.anchored(two, data[3:6])
     # weld: anchor in body 2 is data[0:3], in body 1 data[3:6]; data[6:10] turns body 1 into body 2
@@ -117,7 +116,7 @@ def _meeting_frames(model: mujoco.MjModel, kinematics: Kinematics, e: int, data:
 
 
 class Projection(NamedTuple):
-    """Configuration q (nq,) on the loops, what is left open [m or rad], Newton steps, and whether it closed."""
+    """Configuration q (nq,) on the loops, what is left open [m or rad], steps, and whether it closed."""
 
     q: Array
     open: float
@@ -152,10 +151,10 @@ class Loops:
         tolerance: float = 1e-13,
         steps: int = 30,
     ) -> Projection:
-        """Nearest configuration to `q` (nq,) with all loops closed, by damped Gauss-Newton steps of least norm.
+        """Configuration near `q` (nq,) with all loops closed, by Gauss-Newton steps of least norm.
 
         `metric` (nv, nv) measures the steps, the mass matrix for integrators (default: unity). `held` (nv,)
-        bool freedoms stay. Stops when nothing is open by more than `tolerance`, or rounding ends the progress.
+        bool freedoms stay. Stops when nothing is open by more than `tolerance`, or progress ends.
         """
         space = Space(self.model, limits=False)
         x = space.clip(np.array(q, dtype=float)[None])

@@ -78,7 +78,7 @@ class Kinematics:
         return self._data
 
     def one(self, text: str) -> Moving:
-        """A frame at the configuration of the last `settle`: for one state far quicker than a batch of one."""
+        """A frame at the configuration of the last `settle`: far quicker than a batch of one."""
         if text not in self._mounts:
             self._mounts[text] = self._mount(text)
         mount, data = self._mounts[text], self._data

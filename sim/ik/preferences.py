@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +20,20 @@ PREFERENCES: tuple[Preference, ...] = ("near", "middle", "manipulability", "clea
 _FAINT = 1e-4  # preferences beside wishes: rows this much smaller
 
 
-class Wishes(NamedTuple):
-    """Weighted goals of a problem and one preference, as rows."""
+def wishes(problem: Problem, prefer: Wish) -> Wish:
+    """Rows of a problem of weighted goals, and faintly those of a preference."""
 
-    problem: Problem | None
-    prefer: Wish
-
-    def __call__(self, q: Array) -> Rows:
-        """Rows over a batch q (n, nq)."""
-        faint = self.prefer(q)
-        if self.problem is None:
-            return faint
-        w = self.problem.weighted(self.problem.raw(q))
+    def rows(q: Array) -> Rows:
+        faint, w = prefer(q), problem.weighted(problem.raw(q))
         return Rows(
             np.concatenate([w.r, _FAINT * faint.r], axis=1), np.concatenate([w.J, _FAINT * faint.J], axis=1)
         )
 
+    return rows
+
 
 def preference(kind: str, problem: Problem, q0: Array, obstacles: Sequence[tuple[str, str]] = ()) -> Wish:
-    """Rows of a preference: near `q0`, mid-range, well-conditioned (manipulability), or clear of obstacles."""
+    """Rows of a preference: near `q0`, mid-range, well-conditioned, or clear of obstacles."""
     if kind not in PREFERENCES:
         raise ModelError(unknown("preference", kind, PREFERENCES, where="inverse kinematics"))
     near = _near(problem, q0)

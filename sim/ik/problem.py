@@ -136,7 +136,7 @@ def length_of(model: mujoco.MjModel, kinematics: Kinematics, goals: Sequence[Goa
 
 
 def _touched(loops: list[Closure], moved: NDArray[np.bool_]) -> list[Closure]:
-    """Loops that share freedoms with `moved`, which grows by theirs, and by those of the loops that they touch."""
+    """Loops that share freedoms with `moved`, which grows by theirs, until no further loop does."""
     rest, out = list(loops), []
     while near := [loop for loop in rest if (loop.moved & moved).any()]:
         for loop in near:

@@ -1,9 +1,9 @@
-"""Proofs that goals cannot be met: distances that no joint changes, closed forms, subdivision of small spaces."""
+"""Proofs that goals cannot be met: distances that no joint changes, closed forms, subdivision."""
 
 from __future__ import annotations
 
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,10 +110,10 @@ def _rotation(f: Frame, q: Array) -> Array:
     return np.asarray(f.pose(q)[:3, :3])
 
 
-def _axis(f: Frame, joint: object, q: Array) -> Array:
+def _axis(f: Frame, joint: Any, q: Array) -> Array:
     """Direction of a hinge in the world at q; along parallel axes it is the same at every q."""
     J = f.jacobian(q)
-    return np.asarray(J[:3, joint.v])  # type: ignore[attr-defined]
+    return np.asarray(J[:3, joint.v])
 
 
 def _surface_gap(problem: Problem, goal: PointOnPlane | PointOnLine, q: Array) -> float:
@@ -193,22 +193,21 @@ def closed_form_outside(problem: Problem, form: ClosedForm | None) -> Array | No
     return q if (outside > 1e-7).all() else None
 
 
-def subdivision(problem: Problem, *, boxes: int = _BOXES) -> bool:
+def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
     """Whether a subdivision of the limited range of at most four joints proves that nothing meets the goals.
 
     In a box around q_c with half widths h, a point moves at most sum_j h_j R_j, R_j the farthest it can be
     from joint j's axis; directions and angles at most sum_j h_j. A box whose residual at the centre is larger
-    than that and the tolerance holds no solution.
+    than that and the tolerance holds no solution. Joints that do not move stand as in q0 (nq,).
     """
     columns = np.flatnonzero(problem.moved)
     low, high = problem.space.low[columns], problem.space.high[columns]
     low, high = _whole_turns(problem, columns, low, high)
     if problem.loops or not 1 <= len(columns) <= 4 or not np.isfinite([low, high]).all():
         return False
-    rates = [_rates(problem, g, columns) for g in problem.goals]
-    if any(rate is None for rate in rates):
+    rates = [rate for g in problem.goals if (rate := _rates(problem, g, columns)) is not None]
+    if len(rates) < len(problem.goals):
         return False
-    q0 = problem.space.clip(problem.model.qpos0[None])[0]
     centre, half = 0.5 * (low + high)[None], 0.5 * (high - low)[None]
     seen = 0
     for _ in range(_DEEP * len(columns)):
@@ -221,13 +220,13 @@ def subdivision(problem: Problem, *, boxes: int = _BOXES) -> bool:
         alive = np.ones(len(centre), dtype=bool)
         for goal, group, rate in zip(problem.goals, problem.groups, rates, strict=True):
             position, rotation = goal.errors(r[:, group.rows])
-            room = half @ rate  # type: ignore[operator]
+            room = half @ rate
             slack = np.linalg.norm(np.where(np.isfinite(goal.tolerances()), goal.tolerances(), 0.0))
             alive &= (position <= room[:, 0] + slack) & (rotation <= room[:, 1] + slack)
         centre, half = centre[alive], half[alive]
         if not len(centre):
             return True
-        reach_of = half * np.maximum(sum(r.sum(axis=1) for r in rates), 1e-12)  # type: ignore[union-attr, misc, arg-type]
+        reach_of = half * np.maximum(np.sum([r.sum(axis=1) for r in rates], axis=0), 1e-12)
         widest = np.argmax(reach_of, axis=1)
         step = np.zeros_like(half)
         step[np.arange(len(half)), widest] = 0.5 * half[np.arange(len(half)), widest]
@@ -236,18 +235,21 @@ def subdivision(problem: Problem, *, boxes: int = _BOXES) -> bool:
     return False
 
 
-def _whole_turns(problem: Problem, columns: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def _whole_turns(problem: Problem, columns: NDArray[np.intp], low: Array, high: Array) -> tuple[Array, Array]:
     """Ranges with one whole turn for hinges that have no limits."""
     hinge = np.isin(columns, problem.space.hinges)
     return np.where(hinge & ~np.isfinite(low), -np.pi, low), np.where(hinge & ~np.isfinite(high), np.pi, high)
 
 
-def _rates(problem: Problem, goal: Goal, columns: Array) -> Array | None:
+def _rates(problem: Problem, goal: Goal, columns: NDArray[np.intp]) -> Array | None:
     """Bounds (k, 2) on how fast the goal's metres and radians change with each joint, or None."""
     if not isinstance(goal, (Position, Orientation, Pose, Distance, JointValue)):
         return None
     out = np.zeros((len(columns), 2))
     if isinstance(goal, JointValue):
+        v = scalar_joint(problem.kinematics, goal.joint)[1]
+        if not np.isfinite([problem.space.low[v], problem.space.high[v]]).all():
+            return None  # whole turns of it are not alike
         out[columns == scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
         return out
     if getattr(goal, "relative_to", None) is not None:

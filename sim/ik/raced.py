@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 def racer_of(problem: Problem, start: Array) -> Callable[..., tuple[Array, int]] | None:
     """Compiled search for a problem of one Position, Orientation or Pose of a chain; None for others.
 
-    Takes starts (k, nq) and the most iterations; gives solutions (j, nq) to polish and iterations spent.
+    Takes starts (k, nq) and the most iterations from each; gives the first solution found, (1, nq) to polish
+    or (0, nq), and the iterations spent.
     """
     if len(problem.goals) != 1 or problem.loops:
         return None
@@ -47,19 +48,15 @@ def racer_of(problem: Problem, start: Array) -> Callable[..., tuple[Array, int]]
     columns = [j.q for j in frame.joints]
 
     def run(starts: Array, most: int) -> tuple[Array, int]:
-        out, spent = [], 0
+        spent = 0
         for q in starts:
             raced = compiled(q[columns], R, p, tolerance=(1e-6, 1e-6), most=most)
             spent += int(raced.iterations[0])
             if raced.met[0]:
                 full = start.copy()
                 full[columns] = raced.q[0]
-                out.append(full)
-            if raced.met[0] != (
-                len(starts) > 2
-            ):  # one solution is enough, or one failure where all are wanted
-                break
-        return np.array(out).reshape(-1, problem.space.nq), spent
+                return full[None], spent
+        return np.zeros((0, problem.space.nq)), spent
 
     return run
 
@@ -147,6 +144,6 @@ class ChainSolver:
         tolerance: float = 1e-6,
         most: int = 8000,
     ) -> Raced:
-        """Joint values (k, n) for targets R (k, 3, 3), p (k, 3) [m], `tolerance` of every component [m, rad]."""
+        """Joint values (k, n) for R (k, 3, 3), p (k, 3) [m]; `tolerance` of every component [m, rad]."""
         start = self.middle if seed is None else seed
         return self.racer(start, R, p, tolerance=(tolerance, tolerance), most=most)

@@ -1,10 +1,10 @@
 """How near and how far two frames of a tree can be: bounds that prove that goals cannot be met.
 
-Between the anchors of consecutive turning joints a path has hops: vectors fixed in a link, up to the travel of
-slides. Their lengths bound the distance of the ends, as in a polygon: within [max(0, 2 max l - sum l), sum l].
+Between the anchors of consecutive turning joints a path has hops: vectors fixed in a link, up to the travel
+of slides. Their lengths bound the distance of the ends, as in a polygon: [max(0, 2 max l - sum l), sum l].
 A hinge's anchor may stand anywhere on its axis; every choice gives a bound. When all axes are parallel, the
-height along them does not change and the polygon lies in a plane, where the bounds are attained. Two hops with
-a hinge between them may count as one side, whose length the hinge's range bounds (law of cosines).
+height along them does not change and the polygon lies in a plane, where the bounds are attained. Two hops
+with a hinge between them may count as one side, whose length its range bounds (law of cosines).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Travel(NamedTuple):
 class Hop:
     """Vector between two anchors in the link's frame: `vector` (3,) plus `travels`.
 
-    `start`, `end` are the directions of the hinges' axes at its ends in that frame, None for a ball or an end.
+    `start`, `end`: directions of the hinges' axes at its ends in that frame, None for a ball or an end.
     """
 
     vector: Array
@@ -53,7 +53,7 @@ class Hop:
 
 
 def _extremes(v: Array, travels: tuple[Travel, ...]) -> tuple[float, float]:
-    """Least and greatest length of v plus travels: the greatest at a corner, the least by bounded least squares."""
+    """Least and greatest length of v plus travels: at a corner, and by bounded least squares."""
     if not travels:
         length = float(np.linalg.norm(v))
         return length, length
@@ -127,10 +127,10 @@ def path(a: Frame, b: Frame, space: Space, moved: NDArray[np.bool_], q: Array) -
         if i.q != j.q:
             break
         shared += 1
-    halves = [_hops(f, f.joints[shared:], space, moved, q) for f in (a, b)]
-    if halves[0] is None or halves[1] is None:
+    half_a, half_b = (_hops(f, f.joints[shared:], space, moved, q) for f in (a, b))
+    if half_a is None or half_b is None:
         return None
-    (first_a, rest_a, turns_a), (first_b, rest_b, turns_b) = halves
+    (first_a, rest_a, turns_a), (first_b, rest_b, turns_b) = half_a, half_b
     back = tuple(Travel(-t.axis, t.low, t.high) for t in first_a.travels)
     middle = Hop(first_b.vector - first_a.vector, back + first_b.travels, first_a.end, first_b.end)
     turned = [

@@ -14,7 +14,7 @@ from .closed_form import candidates
 from .descend import Descent, sharpen, tighten
 from .diagnose import diagnose, excluded
 from .goals import Goal
-from .preferences import Preference, Wishes, preference
+from .preferences import Preference, preference, wishes
 from .problem import Problem, unwound
 from .search import Search
 from .settle import Wish, settle
@@ -59,7 +59,7 @@ def solve(
     problem = Problem(model, goals, space, joints=joints)
     judged, wished = _parts(problem)
     prefers = preference(prefer, judged, start, obstacles)
-    wish: Wish = prefers if wished is None else Wishes(wished, prefers)
+    wish: Wish = prefers if wished is None else wishes(wished, prefers)
     search = Search(judged, start, restarts=restarts, seed=seed, hopeless=lambda: excluded(judged, start))
     found = search.solutions(candidates(judged, start))
     if len(found) and (all or prefer != "near"):  # what is best may lie far from the start

@@ -58,7 +58,7 @@ def fits(frame: Frame) -> bool:
 
 
 def step_tape(chain: Chain) -> Tape:
-    """Program (q, t) -> (next, error): the step from q (n), and at q the largest ratio of residual to tolerance.
+    """Program (q, t) -> (next, error): the step from q (n), and the largest residual over tolerance at q.
 
     t (14): the target's R row by row and p, then tolerances of position [m] and rotation [rad].
     """

@@ -1,12 +1,12 @@
-"""Differential inverse kinematics, one tick at a time: a quadratic programme within limits and clear of geoms.
+"""Differential inverse kinematics, one tick at a time, within limits and clear of geoms.
 
     least  sum w |J d + r|^2 + damping |d|^2   over the step d = v dt
     with   joint ranges with room to brake, |v| <= v_max, |v - v_before| <= a_max dt,
            n^T J d >= -share (distance - clearance)  for every named pair of geoms (velocity damper,
            Faverjon & Tournassoud 1987)
 
-A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick has
-a velocity that does, too, so that ranges, velocities and accelerations never contradict each other.
+A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick
+has a velocity that does, too, so that ranges, velocities and accelerations never contradict each other.
 """
 
 from __future__ import annotations
@@ -218,7 +218,9 @@ def step_box(
     high = np.minimum(np.minimum(v_max, v + a_max * dt), braking(above))
     low = np.maximum(np.maximum(-v_max, v - a_max * dt), -braking(-below))
     empty = low > high  # only after a change from outside: then ranges come first
-    middle = np.clip(np.where(empty, 0.5 * (low + high), 0.0), -braking(-below), braking(above))
+    middle = np.clip(
+        0.5 * (np.where(empty, low, 0.0) + np.where(empty, high, 0.0)), -braking(-below), braking(above)
+    )
     return np.where(empty, middle, low) * dt, np.where(empty, middle, high) * dt
 
 

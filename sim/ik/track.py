@@ -118,7 +118,7 @@ def follow(
 
     `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
     by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
-    `around` (k, nq): motion of all joints that do not move for the goals, as keyed; default they stay as `q0`.
+    `around` (k, nq): motion of the joints that do not move for the goals; default they stay as `q0`.
     Raises ModelError for times that are not evenly spaced.
     """
     t = np.asarray(times, dtype=float)
@@ -240,10 +240,9 @@ def _motion(line: _Line, q: Array, limits: Limits) -> Motion:
     rotation = np.array([max((r.rotation for r in rs), default=0.0) for rs in judged])
     off = np.array([not all(r.met for r in rs) for rs in judged])
     missed = _stretches(line, q, off, position, rotation)
-    arrays = [frozen(x) for x in (line.t, q, v, a, position, rotation)]
-    return Motion(
-        line.model, *arrays, missed, limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max)
-    )
+    t, q, v, a, position, rotation = (frozen(x) for x in (line.t, q, v, a, position, rotation))
+    speed, effort = limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max)
+    return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort)
 
 
 def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:

@@ -69,7 +69,7 @@ def _all(scene: Scene) -> Callable[[float], list[Goal]]:
 
 
 def bake(scene: Scene, model: mujoco.MjModel, found: Curves, q0: Array) -> list[Mistake]:
-    """Add curves of the joints that the scene's goals move to `found`; keyed joints stay as they are keyed."""
+    """Add curves of the joints that the scene's goals move to `found`; keyed joints stay as keyed."""
     mistakes, free = _joints(scene, model, found)
     if mistakes:
         return mistakes

@@ -185,7 +185,7 @@ class GoalItem(Item):
     look_at: list[Vector] | None = Field(None, description="point that its axis points to, one row a time")
     axis: Vector = Field((0.0, 0.0, 1.0), description="local axis that looks")
     weight: Positive | None = Field(None, description="a wish of this weight; without it, a hard goal")
-    joints: list[str] = Field(default_factory=list, description="names or patterns that may move; default all")
+    joints: list[str] = Field(default_factory=list, description="names or patterns; default all that move it")
     curve: Curve = "auto"
     ease: str | None = Field(None, description="easing between keys, instead of the curve's own timing")
     before: Literal["hold", "loop"] = "hold"

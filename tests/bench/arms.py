@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-# Panda: Craig's (modified) DH parameters and limits as Franka Emika publishes them for FCI, "Robot and interface
-# specifications": a, d [m], alpha [rad] before each joint, then limits [rad]; flange 0.107 m along z.
+# Panda: Craig's (modified) DH parameters and limits as Franka Emika publishes them for FCI, "Robot and
+# interface specifications": a, d [m], alpha [rad] before each joint, then limits [rad]; flange 0.107 m.
 PANDA = [
     (0.0, 0.333, 0.0, -2.8973, 2.8973),
     (0.0, 0.0, -np.pi / 2, -1.7628, 1.7628),
@@ -59,7 +59,7 @@ def _link(parent, name, pos, quat, limits):
 
 
 def chain_spec(frame, model):
-    """The chain of a frame (`pantograph.sim.kinematics`) alone: hinges about z with their limits, and `tip`."""
+    """The chain of a frame (`pantograph.sim.kinematics`) alone: hinges with their limits, and `tip`."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     body = spec.worldbody

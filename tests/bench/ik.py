@@ -1,4 +1,4 @@
-"""Inverse kinematics: speed and success on three arms beside mink and pink, and verdicts against known truths.
+"""Inverse kinematics: speed beside mink and pink, verdicts against known truths, motion, closed loops.
 
 `make bench NAME=ik`, or `python tests/bench/ik.py [part ...]` with parts protocol, verdicts, motion, loops.
 """
@@ -200,7 +200,8 @@ def protocol(console):
         seconds, met, right = ours(model, R, p)
         us = seconds * 1e6
         table.add_row(name, "Pantograph", str(len(p)), f"{100 * met.mean():.3f} %", f"{us.mean():.1f} us",
-                      f"{np.median(us):.1f} us", f"{np.percentile(us, 99):.1f} us", f"{100 * right.mean():.3f} %")  # fmt: skip
+                      f"{np.median(us):.1f} us", f"{np.percentile(us, 99):.1f} us",
+                      f"{100 * right.mean():.3f} %")  # fmt: skip
         figures += [
             at_least(f"{name}: solved in 5 ms", met.mean(), 0.9999, "share"),
             at_most(f"{name}: mean time", us.mean(), 100, "us"),
@@ -237,7 +238,8 @@ def protocol(console):
             t_late, m_late = (t, slow) if isinstance(slow, np.ndarray) else slow
             us = t_late * 1e6
             table.add_row("", solver, str(len(t)), f"{100 * m.mean():.1f} %", f"{us.mean():.0f} us",
-                          f"{np.median(us):.0f} us", f"{np.percentile(us, 99):.0f} us", f"{100 * m_late.mean():.1f} %")  # fmt: skip
+                          f"{np.median(us):.0f} us", f"{np.percentile(us, 99):.0f} us",
+                          f"{100 * m_late.mean():.1f} %")  # fmt: skip
             figures.append(told(f"{name}: {solver} solved in 5 ms", m.mean(), "share"))
             figures.append(
                 told(f"{name}: {solver} mean over ours", us.mean() / (seconds.mean() * 1e6), "ratio")
@@ -261,8 +263,8 @@ def bare_spec(model):
 
 # Verdicts.
 
-FAMILIES = {"reachable": ik_cases.REACHABLE, "out of reach": ik_cases.BEYOND, "beyond a limit": ik_cases.LIMITED,
-            "conflict": ik_cases.CONFLICT}  # fmt: skip
+FAMILIES = {"reachable": ik_cases.REACHABLE, "out of reach": ik_cases.BEYOND,
+            "beyond a limit": ik_cases.LIMITED, "conflict": ik_cases.CONFLICT}  # fmt: skip
 
 
 def judge(job):
@@ -292,7 +294,8 @@ def verdicts(console):
                 console.print(f"wrong: {family}: {'; '.join(mistakes)}")
             times = np.array([a[2] for a in answers])
             total += len(wrong)
-            table.add_row(group, str(CASES), str(len(wrong)), f"{100 * np.mean([a[3] for a in answers]):.1f} %",
+            proved = np.mean([a[3] for a in answers])
+            table.add_row(group, str(CASES), str(len(wrong)), f"{100 * proved:.1f} %",
                           f"{np.median(times) * 1e3:.0f} ms", f"{times.max() * 1e3:.0f} ms")  # fmt: skip
             figures.append(told(f"wrong verdicts, {group}", len(wrong), f"of {CASES}"))
     console.print(table)
@@ -342,7 +345,8 @@ def motion(console):
         at_most("figure-eight live: deviation not reported", untold, 1e-9, "m"),
         told("figure-eight live: largest deviation", 1e3 * far, "mm"),
         told("figure-eight live: time a tick", 1e3 * each, "ms"),
-        at_most("figure-eight whole: joint speed over its limit", np.abs(steps).max() / speed, 1 + 1e-9, "ratio"),
+        at_most("figure-eight whole: joint speed over its limit", np.abs(steps).max() / speed, 1 + 1e-9,
+                "ratio"),
         at_most("figure-eight whole: acceleration over its limit",
                 np.abs(np.diff(steps, axis=0)).max() / dt / effort, 1 + 1e-6, "ratio"),
         told("figure-eight whole: largest deviation", 1e3 * whole.position.max(), "mm"),

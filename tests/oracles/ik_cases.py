@@ -17,8 +17,8 @@ HINGE, SLIDE, BALL = (getattr(mujoco.mjtJoint, f"mjJNT_{k}") for k in ("HINGE", 
 class Case(NamedTuple):
     """A question and its true answer.
 
-    `distance` is how far out of reach (None: not part of the truth), `joints` sets of joints of which one must
-    be named, `goals` the labels that must be named; `q` a solution when there is one.
+    `distance` is how far out of reach (None: not part of the truth), `joints` sets of joints of which one
+    must be named, `goals` the labels that must be named; `q` a solution when there is one.
     """
 
     family: str
@@ -292,7 +292,7 @@ def _excluding(rng, solutions):
 
 
 def limited_elbow(rng):
-    """Two bones whose elbow cannot bend, or stretch, as far as the point's distance needs (law of cosines)."""
+    """Two bones whose elbow cannot bend, or stretch, as far as the point needs (law of cosines)."""
     a, b = rng.uniform(0.3, 1.0, 2)
     low, high = sorted(rng.uniform(0.1, 2.9, 2))
     high = max(high, low + 0.2)

@@ -12,7 +12,8 @@ def four_bar(lengths=(GROUND, CRANK, COUPLER, ROCKER)):
     return mujoco.MjModel.from_xml_string(f"""
     <mujoco><compiler angle="radian"/><worldbody>
       <body name="crank"><joint name="crank" axis="0 -1 0"/><geom size=".01" mass="1"/>
-        <body name="coupler" pos="{crank} 0 0"><joint name="coupler" axis="0 -1 0"/><geom size=".01" mass="1"/>
+        <body name="coupler" pos="{crank} 0 0"><joint name="coupler" axis="0 -1 0"/>
+          <geom size=".01" mass="1"/>
           <site name="pin" pos="{coupler} 0 0"/></body></body>
       <body name="rocker" pos="{ground} 0 0"><joint name="rocker" axis="0 -1 0"/><geom size=".01" mass="1"/>
         <site name="end" pos="{rocker} 0 0"/></body>
@@ -52,7 +53,7 @@ def stewart(*, seed=0):
         base = np.array([np.cos(low), np.sin(low), 0.0])
         top = 0.5 * np.array([np.cos(high), np.sin(high), 0.0])
         anchors.append((base, top))
-        z = top + [0, 0, 1] - base
+        z = np.add(top, [0, 0, 1]) - base
         length = np.linalg.norm(z)
         quat = np.empty(4)
         mujoco.mju_quatZ2Vec(quat, z / length)

@@ -1,4 +1,4 @@
-"""Motions that inverse kinematics has to master: a figure-eight through a singularity, a walk of sliding feet."""
+"""Motions to master: a figure-eight through a singularity, a walk of sliding feet."""
 
 import numpy as np
 from pantograph.sim.ik import Pose
@@ -21,7 +21,7 @@ def figure_eight(model, *, period=4.0):
 
     def goals(t):
         w = 2 * np.pi * t / period
-        return [Pose("tip", p + [0.02 * np.sin(2 * w), 0.06 * np.sin(w), 0.0], quat)]
+        return [Pose("tip", np.add(p, [0.02 * np.sin(2 * w), 0.06 * np.sin(w), 0.0]), quat)]
 
     return q, goals
 
