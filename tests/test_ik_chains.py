@@ -6,10 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import ik_cases
 from pantograph.models import ModelError, data_robots, load_model
-from pantograph.sim.ik import ChainSolver
-from pantograph.sim.ik.axes import Axis, linear_trig, three_turns, trig_roots
-from pantograph.sim.ik.raced import moving_part
-from pantograph.sim.ik.step import Chain, step_tape
+from pantograph.sim.ik import ChainSolver, Position
+from pantograph.sim.ik.chains.axes import Axis, linear_trig, three_turns, trig_roots
+from pantograph.sim.ik.chains.solver import moving_part
+from pantograph.sim.ik.chains.step import Chain, step_tape
+from pantograph.sim.ik.numeric.descend import _steps, held_projection
+from pantograph.sim.ik.problem import Problem
+from pantograph.sim.ik.space import Space
 from pantograph.sim.kinematics import frame
 from strategies import seeds
 
@@ -211,3 +214,34 @@ def test_a_real_arm_from_its_own_file():
     assert raced.met.all()
     q[:, arm.columns] = raced.q
     np.testing.assert_allclose(frame(model, "body", "wx250s/gripper_link").pose(q), X, atol=3e-6)
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_a_joint_at_its_limit_is_left_out_of_the_step_only_when_it_is_pushed_outward(outward):
+    """Both solvers, against damped least squares with and without the joint's column."""
+    model = load_model("arm6")
+    f, scale = frame(model, "site", "tip"), 0.5
+    q = np.array([0.2, 0.3, -0.4, 0.5, 0.6, -0.3])
+    X, J = f.pose(q), f.jacobian(q)
+    p_T = X[:3, 3] + [0.05, -0.04, 0.03]
+    e = np.concatenate([(X[:3, 3] - p_T) / scale, np.zeros(3)])
+    A = np.vstack([J[3:] / scale, J[:3]])
+    g = A.T @ e
+    j = int(np.argmax(np.abs(g)))
+    model.jnt_range[j, int(g[j] < 0) if outward else int(g[j] > 0)] = q[j]
+    damping = 0.03 * e @ e + 1e-11
+    B = A * (np.arange(6) != j) if outward else A
+    d = -B.T @ np.linalg.solve(B @ B.T + damping * np.eye(6), e)
+    d *= min(1.0, 0.8 / np.abs(d).max())
+    limits = model.jnt_range
+    out, _ = step_tape(Chain(f, limits, True, True, scale)).evaluate(
+        q, np.concatenate([X[:3, :3].ravel(), p_T, [1, 1]])
+    )
+    np.testing.assert_allclose(out, np.clip(q + d, *limits.T), atol=1e-9)
+    assert (d[j] == 0) == outward
+    problem = Problem(model, [Position("tip", p_T)], Space(model))
+    w = problem.weighted(problem.raw(q[None]))
+    mask = held_projection(problem, q[None], (w.r[:, None] @ w.J)[:, 0], w.J)[1][0]
+    assert mask[j] == (not outward)
+    direct = _steps(problem, q[None], w, np.array([1e-9]))[0]
+    assert (direct[j] == 0) == outward

@@ -9,8 +9,8 @@ from oracles import ik_cases
 from oracles.ik_motions import figure_eight, walk, wrist_arm
 from pantograph.models import ModelError, load_model
 from pantograph.sim.ik import Follower, JointValue, Pole, Pose, Position, blend, follow, lock, soften, solve
-from pantograph.sim.ik.band import _Banded, _interior
-from pantograph.sim.ik.qp import minimise
+from pantograph.sim.ik.numeric.band import _Banded, _interior
+from pantograph.sim.ik.numeric.qp import minimise
 from pantograph.sim.kinematics import frame
 from strategies import seeds
 

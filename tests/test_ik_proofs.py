@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from oracles import ik_cases, ik_planar
 from pantograph.sim.ik import Position, solve
-from pantograph.sim.ik.closed_form import closed_form
+from pantograph.sim.ik.chains.closed_form import closed_form
 from pantograph.sim.ik.pose import Kinematics
 from pantograph.sim.ik.problem import Problem
-from pantograph.sim.ik.proofs import goal_gap, pair_gap, subdivision
-from pantograph.sim.ik.reach import path, reach
+from pantograph.sim.ik.proofs.gaps import goal_gap, pair_gap, subdivision
+from pantograph.sim.ik.proofs.reach import path, reach
 from pantograph.sim.ik.space import Space
 from strategies import random_states, seeds, trees
 

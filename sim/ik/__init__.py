@@ -7,6 +7,7 @@ out of reach
 """
 
 from .animate import Locked, Pole, Spread, blend, lock, soften
+from .chains.solver import ChainSolver
 from .goals import (
     CenterOfMass,
     Distance,
@@ -22,7 +23,6 @@ from .goals import (
     Posture,
 )
 from .loops import Loops, Projection
-from .raced import ChainSolver
 from .solve import solve
 from .stream import Follower, Tick
 from .track import Motion, follow

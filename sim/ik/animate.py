@@ -16,12 +16,12 @@ from ...models.naming import lookup, name_of
 from .. import rotations
 from ..errors import ModelError
 from ..kinds import BALL, SCALAR
-from .descend import descend, tighten
 from .goals import Goal, Pose, Position, Rows, Unit, vector
+from .numeric.descend import descend, tighten
+from .numeric.settle import settle
 from .pose import Configurations, Kinematics, Moving
 from .preferences import preference, wishes
 from .problem import Problem
-from .settle import settle
 from .space import Space
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..errors import ModelError, unknown
 from .collision import Clearance
 from .goals import Posture, Rows
+from .numeric.settle import Wish
 from .problem import Problem
-from .settle import Wish
 
 Array = NDArray[np.float64]
 Preference = Literal["near", "middle", "manipulability", "clear"]

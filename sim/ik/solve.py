@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .closed_form import candidates
-from .descend import Descent, sharpen, tighten
-from .diagnose import diagnose, excluded
+from .chains.closed_form import candidates
 from .goals import Goal
+from .numeric.descend import Descent, sharpen, tighten
+from .numeric.search import Search
+from .numeric.settle import Wish, settle
 from .preferences import Preference, preference, wishes
 from .problem import Problem, unwound
-from .search import Search
-from .settle import Wish, settle
+from .proofs.diagnose import diagnose, excluded
 from .space import Space
 from .verdict import Residual, Solution, Verdict
 

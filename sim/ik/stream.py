@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ModelError
 from .collision import Clearance
 from .goals import Goal
+from .numeric.qp import minimise
 from .pose import Kinematics
 from .problem import Problem, freedom_names
-from .qp import minimise
 from .solve import residuals
 from .space import Space
 from .verdict import Residual

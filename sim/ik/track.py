@@ -23,8 +23,8 @@ from ..curves import keyed
 from ..errors import ModelError
 from ..kinds import BALL, FREE
 from ..rotation_curves import keyed_rotation
-from .band import Limits, smoothest_step
 from .goals import Goal
+from .numeric.band import Limits, smoothest_step
 from .pose import Kinematics
 from .problem import Problem
 from .solve import residuals, solve

@@ -10,15 +10,15 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import rotations
-from ..errors import ModelError
-from ..kinematics import Frame
-from .goals import BAND, Orientation, Pose, Position
-from .pose import Kinematics, parse_frame
-from .problem import Problem
+from ... import rotations
+from ...errors import ModelError
+from ...kinematics import Frame
+from ..goals import BAND, Orientation, Pose, Position
+from ..pose import Kinematics, parse_frame
+from ..problem import Problem
+from ..proofs.reach import stood
+from ..space import Space
 from .race import Raced, Racer, racer
-from .reach import stood
-from .space import Space
 from .step import Chain, fits
 
 Array = NDArray[np.float64]

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import rotations
-from ..kinds import FREE, HINGE, SLIDE
-from ..kinematics import Frame
-from .space import Space
+from ... import rotations
+from ...kinds import FREE, HINGE, SLIDE
+from ...kinematics import Frame
+from ..space import Space
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from .space import Space
+from ..space import Space
 
 Array = NDArray[np.float64]
 _REFERENCE = 10.0  # [rad/s^2]

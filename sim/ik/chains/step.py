@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compile.graph import Graph, Scalar, absolute, clip, cos, less, maximum, minimum, sin, sqrt
-from ..compile.tape import Tape
-from ..kinds import HINGE, SLIDE
-from ..kinematics import Frame
+from ...compile.graph import Graph, Scalar, absolute, clip, cos, less, maximum, minimum, sin, sqrt
+from ...compile.tape import Tape
+from ...kinds import HINGE, SLIDE
+from ...kinematics import Frame
 
 Array = NDArray[np.float64]
 Vector = list[Scalar]

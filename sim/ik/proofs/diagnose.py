@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .closed_form import closed_form
-from .descend import Descent, descend, sharpen
-from .goals import Goal, Orientation, Pose, Position, Rows
-from .problem import Problem, freedom_names, unwound
-from .proofs import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
-from .search import Search
-from .settle import settle
-from .verdict import Verdict
+from ..chains.closed_form import closed_form
+from ..goals import Goal, Orientation, Pose, Position, Rows
+from ..numeric.descend import Descent, descend, sharpen
+from ..numeric.search import Search
+from ..numeric.settle import settle
+from ..problem import Problem, freedom_names, unwound
+from ..verdict import Verdict
+from .gaps import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
 
 Array = NDArray[np.float64]
 

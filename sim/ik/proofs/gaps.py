@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import rotations
-from ..kinds import HINGE, SLIDE
-from ..kinematics import Frame
-from .closed_form import ClosedForm
-from .goals import (
+from ... import rotations
+from ...kinds import HINGE, SLIDE
+from ...kinematics import Frame
+from ..chains.closed_form import ClosedForm
+from ..goals import (
     Distance,
     Goal,
     JointValue,
@@ -24,7 +24,7 @@ from .goals import (
     Position,
     scalar_joint,
 )
-from .problem import Problem
+from ..problem import Problem
 from .reach import at_point, offset, path, placed, planar, reach, turning_gap
 
 Array = NDArray[np.float64]
@@ -179,7 +179,7 @@ def closed_form_outside(problem: Problem, form: ClosedForm | None) -> Array | No
     """
     if form is None or not form.complete:
         return None
-    from .space import Space
+    from ..space import Space
 
     free = Space(problem.model, limits=False)
     q = free.clip(form.q) if len(form.q) else form.q

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import rotations
-from ..kinds import BALL, HINGE
-from ..kinematics import Frame
+from ... import rotations
+from ...kinds import BALL, HINGE
+from ...kinematics import Frame
+from ..goals import Pose, Position
+from ..problem import Problem
 from .axes import Axis, around, linear_trig, meeting_point, point_by_three, three_turns, turn_matrix
-from .goals import Pose, Position
-from .problem import Problem
 
 Array = NDArray[np.float64]
 _SWIVELS = 12
@@ -74,7 +74,7 @@ def candidates(problem: Problem, start: Array) -> Array:
 
 def _chain(f: Frame, problem: Problem, start: Array) -> _Chain | None:
     """Axes of the joints that move; None for joints other than hinges and balls."""
-    from .reach import stood
+    from ..proofs.reach import stood
 
     joints, axes, T = [], [], np.eye(4)
     for joint in f.joints:

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compile import jit
-from ..compile.cache import Cache, default_folder, key_of
-from ..compile.llvm import Emitter, declarations, double, kernel
-from ..compile.loops import declare, function
-from ..compile.program import address, facts_of, obtain
-from ..compile.rollout import splat
+from ...compile import jit
+from ...compile.cache import Cache, default_folder, key_of
+from ...compile.llvm import Emitter, declarations, double, kernel
+from ...compile.loops import declare, function
+from ...compile.program import address, facts_of, obtain
+from ...compile.rollout import splat
 from .step import Chain, step_tape
 
 Array = NDArray[np.float64]
@@ -183,7 +183,7 @@ class Racer:
 @lru_cache(maxsize=1)
 def _source() -> str:
     here = Path(__file__).parent
-    files = [here / "race.py", here / "step.py", *sorted((here.parent / "compile").glob("*.py"))]
+    files = [here / "race.py", here / "step.py", *sorted((here.parents[1] / "compile").glob("*.py"))]
     return key_of(*(file.read_bytes() for file in files))
 
 
@@ -212,7 +212,7 @@ def racer(chain: Chain, *, seed: int = 0, cache: bool = True, lanes: int | None 
 
 
 def _ranges(chain: Chain) -> tuple[Array, Array]:
-    from ..kinds import HINGE
+    from ...kinds import HINGE
 
     half = np.array([np.pi if int(j.type) == HINGE else 2 * chain.scale for j in chain.frame.joints])
     rest = np.array([j.rest for j in chain.frame.joints])

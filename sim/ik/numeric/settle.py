@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import rotations
+from ... import rotations
+from ..goals import Rows
+from ..problem import Problem
+from ..space import Space
 from .descend import descend
-from .goals import Rows
-from .problem import Problem
 from .qp import minimise
-from .space import Space
 
 Array = NDArray[np.float64]
 Wish = Callable[[Array], Rows]  # q (n, nq) -> weighted rows to make small

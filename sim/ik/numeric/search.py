@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..chains.solver import racer_of
+from ..problem import Problem
 from .descend import Descent, descend
-from .problem import Problem
-from .raced import racer_of
 
 Array = NDArray[np.float64]
 _BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .goals import Rows
-from .problem import Problem
+from ..goals import Rows
+from ..problem import Problem
 
 Array = NDArray[np.float64]
 _LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
@@ -172,6 +172,6 @@ def _hessian(problem: Problem, q: Array, free: NDArray[np.intp]) -> Array:
 
 def _unclipped(problem: Problem, q: Array, d: Array) -> Array:
     """Steps that may leave the limits a little: a derivative wants both sides."""
-    from .space import Space
+    from ..space import Space
 
     return Space(problem.model, limits=False).step(np.tile(q, (len(d), 1)), d)

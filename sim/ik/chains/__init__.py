@@ -1,0 +1,1 @@
+"""Chains to one frame: closed forms, and searches in machine code."""

@@ -1,0 +1,1 @@
+"""Damped least squares, restarts, self-motions and quadratic programmes."""

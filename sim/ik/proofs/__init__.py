@@ -1,0 +1,1 @@
+"""Why goals cannot be met, and what proves it."""
