@@ -1,7 +1,23 @@
 """Keyed motion made possible: check it against a machine, retime it, or fit it under full dynamics."""
 
 from .check import Report, Violation, check
+from .collocate import Certificate, Fitted, Phase, fit
 from .machine import Machine, machine
+from .prove import Proof, prove
 from .retime import Retimed, retime
 
-__all__ = ["Machine", "Report", "Retimed", "Violation", "check", "machine", "retime"]
+__all__ = [
+    "Certificate",
+    "Fitted",
+    "Machine",
+    "Phase",
+    "Proof",
+    "Report",
+    "Retimed",
+    "Violation",
+    "check",
+    "fit",
+    "machine",
+    "prove",
+    "retime",
+]

@@ -163,4 +163,5 @@ class Tape:
             else:
                 values.append(unary[op](values[a]) if b is None else binary[op](values[a], values[b]))
         outs = [ca.vertcat(*[values[i] for i in rows]) if rows else ca.SX(0, 1) for rows in self.results]
-        return ca.Function(name, arguments, outs, list(self.inputs), list(self.outputs))
+        options = {"allow_duplicate_io_names": True}  # an argument and a result may both be called p
+        return ca.Function(name, arguments, outs, list(self.inputs), list(self.outputs), options)

@@ -1,0 +1,188 @@
+"""Fitted motion obeys the machine: known optima, limits, passive joints, hard keys, and simulation."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from pantograph.controllers.fit import Phase, check, fit, machine, prove
+from pantograph.models import load_model
+from pantograph.sim import PantographError, load
+from pantograph.sim.clip import Clip
+from pantograph.sim.curves import keyed
+from strategies import seeds
+from typer.testing import CliRunner
+
+ARM, ACROBOT = load_model("planar_2r"), load_model("acrobot")
+SLIDER = mujoco.MjModel.from_xml_string(
+    """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+    <geom size=".1" mass="2"/></body></worldbody></mujoco>"""
+)
+
+
+def move(model, joint, times, values, **more):
+    tracks = {joint: keyed(times, values, kind="clamped")}
+    tracks |= {j: keyed(times, v, kind="clamped") for j, v in more.items()}
+    return Clip(model, tracks, model.qpos0)
+
+
+def test_least_effort_between_two_rests_is_the_cubic():
+    """A mass moved with the least integral of force squared from rest to rest: x = 3 s^2 - 2 s^3."""
+    clip = Clip(SLIDER, {"x": keyed([0, 1], [0.0, 1.0], ease="smooth")}, SLIDER.qpos0)
+    found = fit(clip, machine(SLIDER), hard=[1.0], deviation=1e-9, effort=1.0, step=0.02)
+    s = found.t
+    np.testing.assert_allclose(found.clip.evaluate(s).q[:, 0], 3 * s**2 - 2 * s**3, atol=3e-3)
+    peak = np.abs(found.tau[:, 0]).max()
+    assert peak == pytest.approx(2 * 6, rel=0.1)
+
+
+def test_a_force_that_just_suffices_gives_bang_bang():
+    """Mass 2, way 1, time 1: the least force that does it is 4 m d / T^2 = 8, and then q(1/2) = 1/2."""
+    clip = move(SLIDER, "x", [0, 1], [0.0, 1.0])
+    with pytest.raises(PantographError, match="no motion was found"):
+        fit(clip, machine(SLIDER, force=7.5), hard=[1.0])
+    found = fit(clip, machine(SLIDER, force=8.4), hard=[1.0])
+    assert found.certificate.limits <= 1 + 1e-3
+    assert found.clip.evaluate(1.0).q[0] == pytest.approx(1.0, abs=1e-8)
+    assert found.clip.evaluate(0.5).q[0] == pytest.approx(0.5, abs=1e-3)
+
+
+@given(seeds)
+@settings(max_examples=5)
+def test_possible_keys_stay_as_they_are(seed):
+    rng = np.random.default_rng(seed)
+    a, b = 0.5 * rng.uniform(-1, 1, (2, 3))
+    clip = move(ARM, "shoulder", [0, 1.0, 2.0], a, elbow=b)
+    able = machine(ARM, velocity=20.0, force=1e4)
+    found = fit(clip, able, effort=1e-7, step=0.05)
+    assert check(clip, able).possible
+    assert found.deviation < 2e-3
+
+
+@given(seeds)
+@settings(max_examples=5)
+def test_a_pick_beyond_the_torque_limit_becomes_possible(seed):
+    """Limits by MuJoCo's inverse dynamics on a fine grid, hard keys exactly, and a simulated run."""
+    rng = np.random.default_rng(seed)
+    clip = move(ARM, "shoulder", [0, 0.6, 1.2], [-1.2, rng.uniform(-0.2, 0.4), 0.8], elbow=[0.5, 1.8, 0.2])
+    able = machine(ARM, velocity=6.0, force={"shoulder": 75.0, "elbow": 25.0}, top_speed=14.0)
+    assume(not check(clip, able).possible)
+    found = fit(clip, able, hard=[1.2])
+    certificate = found.certificate
+    assert certificate.solver < 1e-8
+    assert certificate.limits <= 1 + 1e-3
+    np.testing.assert_allclose(found.clip.evaluate(1.2).q, clip.evaluate(1.2).q, atol=1e-8)
+    t = np.linspace(0, 1.2, 2001)
+    q, v, a = found.clip.evaluate(t)
+    assert np.abs(v).max() <= 6.0 * (1 + 1e-3)
+    data, share = mujoco.MjData(ARM), 0.0
+    for row in zip(q, v, a, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = row
+        mujoco.mj_inverse(ARM, data)
+        drawn = np.abs(data.qfrc_inverse) / [75.0, 25.0]
+        share = max(share, (drawn + np.where(data.qfrc_inverse * row[1] > 0, np.abs(row[1]) / 14.0, 0)).max())
+    assert share <= 1 + 5e-3
+    proof = prove(found, able)
+    assert proof.worst < 0.01
+
+
+def test_jerk_and_acceleration_are_bounded():
+    clip = move(ARM, "shoulder", [0, 0.5, 1.5], [0.0, 0.8, 0.8], elbow=[0, 0, 0])
+    able = machine(ARM, acceleration=5.0, jerk=60.0, force=1e4)
+    found = fit(clip, able, hard=[1.5])
+    t = np.linspace(0, 1.5, 3001)
+    a = found.clip.evaluate(t[:-1]).a  # held from the last key on
+    assert np.abs(a).max() <= 5.0 * (1 + 5e-3)
+    assert np.abs(np.diff(a, axis=0)).max() / (t[1] - t[0]) <= 60.0 * 1.6  # between nodes a quintic may bend
+
+
+def test_an_acrobot_swings_up_without_a_motor_in_its_shoulder():
+    clip = move(ACROBOT, "shoulder", [0, 4.0], [0.0, np.pi], elbow=[0.0, 0.0])
+    able = machine(ACROBOT, driven=np.array([False, True]), force={"elbow": 15.0})
+    found = fit(clip, able, hard=[4.0], step=0.05, deviation=0.1, refine=2)
+    assert found.certificate.dynamics < 0.05
+    assert np.abs(found.tau[:, 0]).max() == 0.0
+    assert np.abs(found.tau[:, 1]).max() <= 15.0
+    proof = prove(found, able)
+    assert proof.worst < 0.05
+    assert abs(proof.q[-1, 0] - np.pi) < 0.05
+
+
+HOPPER = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/><body name="trunk" pos="0 0 0">
+  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+  <geom size=".1" mass="3" contype="0" conaffinity="0"/>
+  <body name="thigh"><joint name="hip" axis="0 1 0" range="-90 90"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass=".5" contype="0" conaffinity="0"/>
+    <body name="shank" pos="0 0 -.3"><joint name="knee" axis="0 1 0" range="-150 -5"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".3" contype="0" conaffinity="0"/>
+      <site name="foot" pos="0 0 -.3"/></body></body></body></worldbody></mujoco>"""
+
+
+def test_a_jump_pushes_off_flies_and_lands():
+    """Contacts as phases: in flight the mass centre falls freely, on the ground the foot rests."""
+    model = mujoco.MjModel.from_xml_string(HOPPER)
+    bent = np.deg2rad(45.0)
+    height = 0.6 * np.cos(bent)
+    times, up = [0, 0.5, 0.75, 1.0, 1.5], [height, height, height + 0.3, height, height]
+    tracks = {"z": keyed(times, up, kind="clamped")}
+    tracks |= {j: keyed([0], [x]) for j, x in (("x", 0.0), ("hip", bent), ("knee", -2 * bent))}
+    clip = Clip(model, {"z": tracks["z"]}, [0.0, height, bent, -2 * bent])
+    able = machine(model, driven=np.array([False, False, True, True]), force={"hip": 120.0, "knee": 120.0})
+    phases = [Phase(0.0, 0.5, ("foot",)), Phase(1.0, 1.5, ("foot",))]
+    found = fit(clip, able, phases=phases, hard=[0.75], step=0.025, refine=1, at_rest=True)
+    assert found.certificate.solver < 1e-7
+    flight = (found.t > 0.5) & (found.t < 1.0)
+    assert not found.contact[flight].any()
+    ground = ~flight
+    assert (found.contact[ground, 2] >= -1e-6).all()
+    assert (np.abs(found.contact[ground, 0]) <= 0.8 * found.contact[ground, 2] + 1e-6).all()
+    data, heights, feet = mujoco.MjData(model), [], []
+    for q in found.clip.evaluate(found.t).q:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        heights.append(data.subtree_com[1, 2])
+        feet.append(data.site("foot").xpos[2])
+    fall = np.polyfit(found.t[flight], np.array(heights)[flight], 2)[0]
+    assert 2 * fall == pytest.approx(-9.81, rel=0.02)
+    np.testing.assert_allclose(np.array(feet)[ground], 0.0, atol=1e-6)
+    assert found.clip.evaluate(0.75).q[1] == pytest.approx(height + 0.3, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("clip", "words", "message"),
+    [
+        (move(ARM, "elbow", [0, 1], [0, 1]), {"hard": [2.0]}, "hard key at 2 s lies outside"),
+        (Clip(load_model("quadruped"), {}), {}, "ball or free joints"),
+        (move(ARM, "elbow", [0, 1], [0, 1]), {"phases": [Phase(0, 1, ("toe",))]}, "no site 'toe'"),
+    ],
+)
+def test_mistakes_are_told(clip, words, message):
+    with pytest.raises(PantographError, match=message):
+        fit(clip, machine(clip.model), **words)
+
+
+def test_the_command_checks_retimes_and_fits(tmp_path):
+    import typer
+    from pantograph.controllers.cli import fit as command
+
+    app = typer.Typer()
+    app.command()(command)
+    scene = tmp_path / "swing.toml"
+    scene.write_text(
+        'duration = 1.0\n[[models]]\nfile = "planar_2r"\n'
+        '[[keys]]\njoint = "shoulder"\ntimes = [0, 1]\nvalues = [-1.0, 0.5]\n'
+        '[[keys]]\njoint = "elbow"\ntimes = [0, 1]\nvalues = [0.5, 1.5]\n'
+    )
+    run = CliRunner()
+    base = [str(scene), "--velocity", "2", "--out", str(tmp_path)]
+    done = run.invoke(app, [*base, "--how", "check"])
+    assert done.exit_code == 1
+    assert "shoulder: velocity 2.25" in done.output
+    done = run.invoke(app, [*base, "--how", "nearest"])
+    assert done.exit_code == 0, done.output
+    recording = load(tmp_path / "swing.fit.npz")
+    assert np.abs(recording.v).max() <= 2.0 * (1 + 1e-6)
+    assert recording.q[-1, 0] == pytest.approx(0.5, abs=1e-6)
+    done = run.invoke(app, [*base, "--how", "fit", "--force", "100", "--hard", "1"])
+    assert done.exit_code == 0, done.output
+    assert "LQR in the loop" in done.output
