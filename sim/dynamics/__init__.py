@@ -4,6 +4,7 @@ from .laws import LinearFeedback, joint_pd
 from .rollouts import STATUS, Path
 from .sensitivity import StepDerivatives
 from .smooth import Derivatives, Smooth, Stats, compile_model
+from .stepper import Stepper
 from .support import differences, unsupported
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Smooth",
     "Stats",
     "StepDerivatives",
+    "Stepper",
     "compile_model",
     "differences",
     "joint_pd",
