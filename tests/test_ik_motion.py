@@ -84,6 +84,11 @@ def test_what_cannot_be_followed_is_told_with_its_reason():
     )
     assert fast.missed and fast.missed[0].verdict is None
     assert fast.speed <= 1.0
+    shaken = follow(
+        model, lambda t: [Position("tip", [1.2 + 0.3 * np.sin(8 * t), 0.2, 0])], times, acceleration=10.0
+    )
+    assert shaken.missed and 0.9 < shaken.effort <= 1.0
+    assert np.abs(np.diff(shaken.q, 2, axis=0)).max() / 0.05**2 <= 10.0
 
 
 @settings(max_examples=15, deadline=None)

@@ -115,6 +115,17 @@ def test_subdivision_proves_what_limits_exclude_and_nothing_else():
         assert not subdivision(Problem(model, [Position("tip", [*tip, 0])], Space(model)), model.qpos0)
 
 
+def test_values_beyond_a_turn_are_proved_only_when_nothing_has_them():
+    """A joint without limits at 4.2 rad: a box of one turn around zero does not hold it."""
+    model = ik_cases.planar_chain((1.0, 0.8))
+    q = np.array([0.5, 4.2])
+    goals = [Position("tip", [*ik_planar.forward((1.0, 0.8), q)[-1], 0]), ik_cases.JointValue("j1", 4.2)]
+    assert not subdivision(Problem(model, goals, Space(model)), model.qpos0)
+    assert solve(model, goals).solved
+    goals[1] = ik_cases.JointValue("j1", 4.0)
+    assert subdivision(Problem(model, goals, Space(model)), model.qpos0)
+
+
 def test_limits_of_a_wrist_arm_are_proved_by_its_closed_form():
     """All eight solutions known: a range around none of them."""
     from pantograph.models import load_model

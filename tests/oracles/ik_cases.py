@@ -402,6 +402,27 @@ def conflict_of_two_in_three(rng):
     return Case("two of three", model, goals, "conflict", labels=frozenset("ab"))
 
 
+def conflict_beside_an_innocent_goal(rng):
+    """A 2R arm to a point with a wrong heading, which no chain length excludes, beside another arm's goal."""
+    case = conflict_heading(rng)
+    lengths, other = rng.uniform(0.3, 1.2, 2), rng.uniform(0.3, 1.2, 2)
+    q = np.array([rng.uniform(-3, 3), rng.choice([-1, 1]) * rng.uniform(0.2, 2.9)])
+    p, heading = planar.forward(lengths, q)[-1], rng.uniform(-np.pi, np.pi)
+    if np.abs(planar.wrap(planar.two_links(lengths, p).sum(axis=1) - heading)).min() < 0.01:
+        return conflict_beside_an_innocent_goal(rng)
+
+    def links(sizes):
+        z = (0, 0, 1)
+        ends = [([0, 0, 0], HINGE, z, None), ([sizes[0], 0, 0], HINGE, z, None)]
+        return [*ends, ([sizes[1], 0, 0], None, None, None)]
+
+    model = chain(links(lengths), branches=[links(other)])
+    free = planar.forward(other, rng.uniform(-3, 3, 2))[-1]
+    goals = [Position("tip", [*p, 0], name="place"), Position("tip1", [*free, 0], name="innocent"),
+             Orientation("tip", quat_z(heading), name="heading")]  # fmt: skip
+    return Case("beside an innocent goal", model, goals, "conflict", labels=case.labels)
+
+
 REACHABLE = (reachable_pose, reachable_point, reachable_at_limit, reachable_stretched, reachable_wrist,
              reachable_several)  # fmt: skip
 BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt)
@@ -413,7 +434,14 @@ LIMITED = (
     limited_direction,
     beyond_slides,
 )
-CONFLICT = (conflict_one_site, conflict_too_far, conflict_heading, conflict_value, conflict_of_two_in_three)
+CONFLICT = (
+    conflict_one_site,
+    conflict_too_far,
+    conflict_heading,
+    conflict_value,
+    conflict_of_two_in_three,
+    conflict_beside_an_innocent_goal,
+)
 
 
 def mistakes(case, solution, *, tolerance=1e-5):

@@ -225,7 +225,7 @@ def _conflict(
     names = tuple(g.label for g in goals)
     reason = f"{' and '.join(names)} exclude each other; at best {_words(position, rotation)} remain"
     if proved:
-        reason += f", {_words(gap.position, gap.rotation)} proved by {gap.by}"
+        reason += f", {_words(gap.position, gap.rotation)} in sum, proved by {gap.by}"
     else:
         part = problem.only(goals)
         proved = subdivision(part.without_limits(), search.start)

@@ -203,6 +203,14 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
     columns = np.flatnonzero(problem.moved)
     low, high = problem.space.low[columns], problem.space.high[columns]
     low, high = _whole_turns(problem, columns, low, high)
+    for goal in problem.goals:
+        if isinstance(goal, JointValue):
+            at = columns == scalar_joint(problem.kinematics, goal.joint)[1]
+            room = float(goal.tolerances()[0])
+            bottom, top = (problem.space.low[columns][at], problem.space.high[columns][at])
+            low[at], high[at] = np.maximum(bottom, goal.value - room), np.minimum(top, goal.value + room)
+    if (low > high).any():
+        return True
     if problem.loops or not 1 <= len(columns) <= 4 or not np.isfinite([low, high]).all():
         return False
     rates = [rate for g in problem.goals if (rate := _rates(problem, g, columns)) is not None]
@@ -247,9 +255,6 @@ def _rates(problem: Problem, goal: Goal, columns: NDArray[np.intp]) -> Array | N
         return None
     out = np.zeros((len(columns), 2))
     if isinstance(goal, JointValue):
-        v = scalar_joint(problem.kinematics, goal.joint)[1]
-        if not np.isfinite([problem.space.low[v], problem.space.high[v]]).all():
-            return None  # whole turns of it are not alike
         out[columns == scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
         return out
     if getattr(goal, "relative_to", None) is not None:
