@@ -97,7 +97,9 @@ def _add_props(spec: mujoco.MjSpec, scene: Scene) -> list[Mistake]:
     taken = {b.name for b in spec.bodies} | {j.name for j in spec.joints} | {g.name for g in spec.geoms}
     for i, prop in enumerate(scene.props):
         if prop.name in taken:
-            mistakes.append(Mistake(("props", i, "name"), f"the models have a {prop.name!r} already; choose another name"))
+            mistakes.append(
+                Mistake(("props", i, "name"), f"the models have a {prop.name!r} already; choose another name")
+            )
         elif prop.file is not None and not (scene.base / prop.file).is_file():
             mistakes.append(Mistake(("props", i, "file"), f"no mesh file {scene.base / prop.file}"))
         else:
