@@ -19,7 +19,7 @@ app = typer.Typer(
     name="pantograph",
     help="Key, simulate, film and mirror articulated structures.",
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
 console = Console()
