@@ -284,3 +284,56 @@ def test_steps_and_differences_are_inverse(seed, _):
         mujoco.mj_integratePos(model, row, step, 1.0)
     np.testing.assert_allclose(space.step(q, d), truth, atol=1e-9)
     assert rotations.normalize(q[:, 3:7]).shape == (3, 4)
+
+
+def _three_links_beside_a_post():
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    body = spec.worldbody
+    for i, length in enumerate((0.6, 0.5, 0.4)):
+        body = body.add_body(name=f"b{i}", pos=[(0, 0.6, 0.5)[i], 0, 0])
+        body.add_joint(name=f"j{i}", type=ik_cases.HINGE, axis=[0, 0, 1], range=[-2.5, 2.5], limited=True)
+        ends = [0, 0, 0, length, 0, 0]
+        body.add_geom(name=f"g{i}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[0.03, 0, 0])
+    body.add_site(name="tip", pos=[0.4, 0, 0])
+    spec.worldbody.add_geom(
+        name="post", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0, 0], pos=[0.62, 0.05, 0]
+    )
+    return spec.compile()
+
+
+def test_clear_keeps_away_from_obstacles():
+    model = _three_links_beside_a_post()
+    data, goal, q0 = mujoco.MjData(model), Position("tip", [0.8, 0.7, 0]), [0.3, 0.5, 0.4]
+    pairs = [(f"g{i}", "post") for i in range(3)]
+
+    def distance(q):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        return min(mujoco.mj_geomDistance(model, data, i, model.geom("post").id, 1.0, np.zeros(6)) for i in
+                   (model.geom(f"g{k}").id for k in range(3)))  # fmt: skip
+
+    near, clear = solve(model, goal, q0=q0), solve(model, goal, q0=q0, prefer="clear", obstacles=pairs)
+    assert near.solved and clear.solved
+    assert distance(near.q) < 0.05
+    assert distance(clear.q) > 0.09
+
+
+def test_manipulability_is_the_greatest_of_the_self_motion():
+    lengths = (1.0, 0.8, 0.6)
+    model = ik_cases.planar_chain(lengths, [(-2.8, 2.8)] * 3)
+    solution = solve(model, Position("tip", [1.2, 0.9, 0]), q0=[0.1, 0.9, 0.2], prefer="manipulability")
+
+    def manipulability(q):
+        points = ik_planar.forward(lengths, q)
+        J = np.array([[-(points[-1] - p)[1], (points[-1] - p)[0]] for p in points[:-1]]).T
+        return np.sqrt(np.linalg.det(J @ J.T))
+
+    best = 0.0
+    for first in np.linspace(-2.8, 2.8, 2001):
+        rest = np.array([1.2, 0.9]) - [np.cos(first), np.sin(first)]
+        turned = [[np.cos(first), np.sin(first)], [-np.sin(first), np.cos(first)]] @ rest
+        if 0.2 < np.hypot(*rest) < 1.4:
+            pairs = [p for p in ik_planar.two_links(lengths[1:], turned) if np.abs(p).max() <= 2.8]
+            best = max([best, *(manipulability([first, *p]) for p in pairs)])
+    assert manipulability(solution.q) == pytest.approx(best, rel=2e-3)

@@ -77,13 +77,17 @@ def test_no_proof_excludes_what_some_configuration_has(model, seed):
 def test_bounds_of_planar_arms_are_attained(seed):
     rng = np.random.default_rng(seed)
     lengths = rng.uniform(0.1, 1.0, rng.integers(2, 6))
-    model = ik_cases.planar_chain(lengths)
+    heights, n = rng.normal(size=len(lengths)), len(lengths)
+    axes = [(0, 0, rng.choice([-1, 1])) for _ in lengths]
+    offsets = [np.zeros(3), *([length, 0, h] for length, h in zip(lengths, heights, strict=True))]
+    links = [(offset, ik_cases.HINGE, axis, None) for offset, axis in zip(offsets[:n], axes, strict=True)]
+    model = ik_cases.chain([*links, (offsets[n], None, None, None)])
     space, kinematics = Space(model), Kinematics(model)
     moved = np.ones(model.nv, dtype=bool)
     hops = path(kinematics.frame("body:link_0"), kinematics.frame("tip"), space, moved, model.qpos0)
-    bounds = reach(hops)
-    assert bounds.high == pytest.approx(sum(lengths))
-    assert bounds.low == pytest.approx(max(0.0, 2 * max(lengths) - sum(lengths)), abs=1e-12)
+    bounds, height = reach(hops), heights.sum()
+    assert bounds.high == pytest.approx(np.hypot(sum(lengths), height))
+    assert bounds.low == pytest.approx(np.hypot(max(0.0, 2 * max(lengths) - sum(lengths)), height), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(30))

@@ -8,25 +8,13 @@ out of reach
 
 from .animate import Locked, Pole, Spread, blend, lock, soften
 from .chains.solver import ChainSolver
-from .goals import (
-    CenterOfMass,
-    Distance,
-    Goal,
-    JointValue,
-    LookAt,
-    Mirror,
-    Orientation,
-    PointOnLine,
-    PointOnPlane,
-    Pose,
-    Position,
-    Posture,
-)
+from .goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
 from .loops import Loops, Projection
 from .solve import solve
 from .stream import Follower, Tick
 from .track import Motion, follow
 from .verdict import Residual, Solution, Verdict
+from .wholes import CenterOfMass, JointValue, Posture
 
 __all__ = [
     "CenterOfMass",

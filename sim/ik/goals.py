@@ -17,12 +17,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...models.naming import lookup
 from .. import rotations
 from ..errors import ModelError
-from ..kinds import SCALAR
 from .pose import Configurations, Kinematics, Moving
-from .space import Space
 
 Array = NDArray[np.float64]
 Unit = Literal["m", "rad"]
@@ -342,108 +339,6 @@ class Distance(Goal):
         long = _norm(p)
         u = p / np.maximum(long, 1e-12)[:, None]
         return Rows(long[:, None] - self.distance, u[:, None, :] @ J)
-
-
-@dataclass(frozen=True, eq=False)
-class CenterOfMass(Goal):
-    """The centre of mass of everything that moves is at `target` (3,) [m]; tolerances free an axis by inf."""
-
-    target: ArrayLike
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "target", vector("target", self.target))
-        super().__post_init__()
-
-    @property
-    def label(self) -> str:
-        return self.name or "centre of mass"
-
-    def frames(self) -> tuple[str, ...]:
-        return ()
-
-    def units(self) -> tuple[Unit, ...]:
-        return ("m",) * 3
-
-    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
-        mask = np.zeros(kinematics.model.nv, dtype=bool)
-        for _, f in kinematics.masses():
-            mask[f.dofs] = True
-        return mask
-
-    def rows(self, c: Configurations) -> Rows:
-        p, J = c.center_of_mass()
-        return Rows(p - np.asarray(self.target), J)
-
-
-@dataclass(frozen=True, eq=False)
-class JointValue(Goal):
-    """The hinge or slide `joint` stands at `value` [rad or m]."""
-
-    joint: str
-    value: float
-
-    @property
-    def label(self) -> str:
-        return self.name or f"joint {self.joint}"
-
-    def frames(self) -> tuple[str, ...]:
-        return ()
-
-    def units(self) -> tuple[Unit, ...]:
-        return ("rad",)
-
-    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
-        mask = np.zeros(kinematics.model.nv, dtype=bool)
-        mask[scalar_joint(kinematics, self.joint)[1]] = True
-        return mask
-
-    def rows(self, c: Configurations) -> Rows:
-        q, v = scalar_joint(c.kinematics, self.joint)
-        J = np.zeros((len(c.q), 1, c.model.nv))
-        J[:, 0, v] = 1.0
-        return Rows(c.q[:, q : q + 1] - self.value, J)
-
-
-def scalar_joint(kinematics: Kinematics, name: str) -> tuple[int, int]:
-    """Addresses in q and v of a hinge or slide; ModelError for other joints."""
-    model = kinematics.model
-    j = lookup(model, "joint", name)
-    if int(model.jnt_type[j]) not in SCALAR:
-        raise ModelError(f"joint {name!r} is no hinge or slide: it has no single value")
-    return int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-
-
-@dataclass(frozen=True, eq=False)
-class Posture(Goal):
-    """The whole configuration is `q` (nq,); nearly always a wish, so give it a weight."""
-
-    q: ArrayLike
-
-    @property
-    def label(self) -> str:
-        return self.name or "posture"
-
-    def frames(self) -> tuple[str, ...]:
-        return ()
-
-    def units(self) -> tuple[Unit, ...]:
-        return ("rad",)
-
-    def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
-        unit: Unit = "rad"
-        return (unit,) * int(model.nv)
-
-    def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
-        return np.ones(kinematics.model.nv, dtype=bool)
-
-    def rows(self, c: Configurations) -> Rows:
-        space = Space(c.model)
-        d = space.difference(c.q, np.asarray(self.q, dtype=float)[None])
-        J = np.tile(np.eye(c.model.nv), (len(d), 1, 1))
-        for ball in space.balls:
-            v = slice(ball.v, ball.v + 3)
-            J[:, v, v] = rotations.inverse_right_jacobian(d[:, v])
-        return Rows(d, J)
 
 
 @dataclass(frozen=True, eq=False)

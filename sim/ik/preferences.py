@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError, unknown
 from .collision import Clearance
-from .goals import Posture, Rows
+from .goals import Rows
 from .numeric.settle import Wish
 from .problem import Problem
+from .space import Space
+from .wholes import Posture
 
 Array = NDArray[np.float64]
 Preference = Literal["near", "middle", "manipulability", "clear"]
@@ -82,13 +84,19 @@ def _middle(problem: Problem) -> Wish:
 
 
 def _manipulability(problem: Problem) -> Wish:
-    """One row 1/w, w = sqrt(det J J^T) of the weighted goal rows (Yoshikawa 1985), by central differences."""
+    """One row 1/w, w = sqrt(det J J^T) of the weighted goal rows (Yoshikawa 1985), by central differences.
+
+    Directions that the chain never moves in, as out of a planar arm's plane, are left out of w.
+    """
     h, columns = 1e-6, np.flatnonzero(problem.moved)
+    space, free = problem.space, Space(problem.model, limits=False)
+    some = space.random(np.random.default_rng(0), 8, space.clip(problem.model.qpos0[None])[0], problem.moved)
+    rank = int(np.linalg.matrix_rank(problem.weighted(problem.raw(some)).J, tol=1e-9).max())
 
     def inverse(q: Array) -> Array:
         J = problem.weighted(problem.raw(q)).J
         s = np.linalg.svd(J, compute_uv=False)
-        return np.asarray(1.0 / np.maximum(np.prod(s, axis=1), 1e-9))
+        return np.asarray(1.0 / np.maximum(np.prod(s[:, :rank], axis=1), 1e-9))
 
     def rows(q: Array) -> Rows:
         J = np.zeros((len(q), 1, problem.space.nv))
@@ -96,9 +104,7 @@ def _manipulability(problem: Problem) -> Wish:
             d = np.zeros((2 * len(columns), problem.space.nv))
             d[np.arange(len(columns)), columns] = h
             d[len(columns) + np.arange(len(columns)), columns] = -h
-            from .space import Space
-
-            f = inverse(Space(problem.model, limits=False).step(np.tile(x, (len(d), 1)), d))
+            f = inverse(free.step(np.tile(x, (len(d), 1)), d))
             J[k, 0, columns] = (f[: len(columns)] - f[len(columns) :]) / (2 * h)
         return Rows(inverse(q)[:, None], J)
 

@@ -12,19 +12,9 @@ from ... import rotations
 from ...kinds import HINGE, SLIDE
 from ...kinematics import Frame
 from ..chains.closed_form import ClosedForm
-from ..goals import (
-    Distance,
-    Goal,
-    JointValue,
-    LookAt,
-    Orientation,
-    PointOnLine,
-    PointOnPlane,
-    Pose,
-    Position,
-    scalar_joint,
-)
+from ..goals import Distance, Goal, LookAt, Orientation, PointOnLine, PointOnPlane, Pose, Position
 from ..problem import Problem
+from ..wholes import JointValue, scalar_joint
 from .reach import at_point, offset, path, placed, planar, reach, turning_gap
 
 Array = NDArray[np.float64]
@@ -206,9 +196,9 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
     for goal in problem.goals:
         if isinstance(goal, JointValue):
             at = columns == scalar_joint(problem.kinematics, goal.joint)[1]
-            room = float(goal.tolerances()[0])
+            near = float(goal.tolerances()[0])
             bottom, top = (problem.space.low[columns][at], problem.space.high[columns][at])
-            low[at], high[at] = np.maximum(bottom, goal.value - room), np.minimum(top, goal.value + room)
+            low[at], high[at] = np.maximum(bottom, goal.value - near), np.minimum(top, goal.value + near)
     if (low > high).any():
         return True
     if problem.loops or not 1 <= len(columns) <= 4 or not np.isfinite([low, high]).all():
