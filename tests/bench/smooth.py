@@ -1,4 +1,4 @@
-"""The smooth engine against MuJoCo and Pinocchio. `make bench NAME=smooth` (some minutes).
+"""The smooth engine against MuJoCo, Pinocchio and Drake. `make bench NAME=smooth` (some minutes).
 
 Ratios of CPU time in one run, the same stripped model for every engine; medians of alternating rounds with
 their spread. A part is a function that returns figures; the last line is one JSON object of all of them.
@@ -235,6 +235,40 @@ def pinocchio():
             yield at_least("vector-Jacobian product over Pinocchio's derivatives, humanoid", r, 5, seen)
 
 
+def drake():
+    python = peers.drake_python()
+    if isinstance(python, str):
+        yield absent("Drake", python)
+        return
+    for name in track(FIVE, "Drake"):
+        source = models.load(name)
+        if source is None:
+            yield absent(f"Drake, {name}", "its data is not here")
+            continue
+        model = models.stripped(source)
+        q, v, _, _ = models.states(model, 64)
+        tau = np.random.default_rng(1).normal(size=v.shape)
+        one, batch = compile_model(model, lanes=1, threads=1), compile_model(model, threads=1)
+        calls = {
+            "one": _on_states(one, "forward", q=q, v=v, tau=tau),
+            "batch": _on_states(batch, "forward", q=q, v=v, tau=tau),
+        }
+        before = peers.drake(python, model, q, v, tau)
+        if isinstance(before, str):
+            yield absent(f"Drake, {name}", before)
+            continue
+        times = alternating(calls, rounds=5)
+        after = peers.drake(python, model, q, v, tau)
+        theirs, off = (before[0] + after[0]) / 2, (before[1] + after[1]) / 2
+        ns = {k: np.median(x) / (len(q) * REPEATS) * 1e9 for k, x in times.items()}
+        worst = np.abs(one.forward(q, v, tau=tau) - before[2]).max() / np.abs(before[2]).max()
+        yield at_most(f"qacc against Drake, {name}", worst, 1e-10)
+        seen = f"Drake's evaluation {theirs:.0f} ns (before ours {before[0]:.0f}, after {after[0]:.0f}), its "
+        seen += f"Python calls of {off:.0f} ns measured on cached answers and taken off; "
+        seen += f"one lane {ns['one']:.0f}, lanes {ns['batch']:.0f}"
+        yield at_least(f"forward dynamics over Drake, {name}", theirs / ns["one"], 1, seen)
+
+
 # ---- accuracy for its price
 
 
@@ -383,6 +417,7 @@ PARTS = {
     "rollouts": rollouts,
     "two_cores": two_cores,
     "pinocchio": pinocchio,
+    "drake": drake,
     "to_an_error": to_an_error,
     "first_use": first_use,
 }

@@ -1,4 +1,4 @@
-"""Pinocchio beside the smooth engine: the same model written out as numbers, run in its own process."""
+"""Pinocchio and Drake beside the smooth engine: the same joints written out, run in their own processes."""
 
 import shutil
 import subprocess
@@ -10,9 +10,22 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 VENV = ROOT / ".bench" / "pinocchio"
+DRAKE = ROOT / ".bench" / "drake"
 SOURCE = Path(__file__).parent / "peers" / "pinocchio.cpp"
 FLAGS = "-std=c++17 -O3 -march=native -DNDEBUG"
 FLAGS += " -DBOOST_MPL_LIMIT_LIST_SIZE=30 -DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"  # as its CMake files
+
+
+def _missing(folder, package):
+    """Make the environment with its package unless it is there; a sentence when that fails."""
+    if folder.exists():
+        return None
+    pip = [folder / "bin" / "python", "-m", "pip", "install", "-q", package]
+    for command in ([sys.executable, "-m", "venv", folder], pip):
+        if subprocess.run(command, capture_output=True).returncode:
+            shutil.rmtree(folder, ignore_errors=True)
+            return f"absent: `pip install {package}` failed"
+    return None
 
 
 def program():
@@ -22,14 +35,8 @@ def program():
         return binary
     if shutil.which("g++") is None:
         return "absent: timing Pinocchio without Python takes a C++ compiler (g++), which is not here"
-    if not VENV.exists():
-        subprocess.run([sys.executable, "-m", "venv", VENV], check=True)
-        got = subprocess.run(
-            [VENV / "bin" / "python", "-m", "pip", "install", "-q", "pin"], capture_output=True
-        )
-        if got.returncode:
-            shutil.rmtree(VENV)
-            return "absent: `pip install pin` failed"
+    if why := _missing(VENV, "pin"):
+        return why
     prefix = next(VENV.glob("lib/python*/site-packages/cmeel.prefix"), None)
     import casadi
 
@@ -139,3 +146,77 @@ def pinocchio(binary, model, q, v, tau):
         for x, y, row in zip(q, v, out[2:], strict=True)
     ]
     return aba, derivatives, np.array(a)
+
+
+def drake_python():
+    """The Python that has Drake; a sentence saying why not when it cannot be had."""
+    if why := _missing(DRAKE, "drake"):
+        return why
+    python = DRAKE / "bin" / "python"
+    try:
+        command = [python, "-c", "import pydrake.multibody.plant"]
+        subprocess.run(command, capture_output=True, text=True, check=True)
+    except subprocess.CalledProcessError as error:
+        return f"absent: {_last_line(error.stderr)}"
+    except OSError as error:
+        return f"absent: {error}"
+    return python
+
+
+def _last_line(text):
+    return (text.strip().splitlines() or ["it ended without a word"])[-1][:200]
+
+
+def _mjcf(model):
+    """The model as MJCF with one body a joint: welded bodies lumped, hinges and slides along z."""
+    rows = joints_of(model)
+
+    def body(i):
+        _, kind, X, m, c, inertia = rows[i]
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, X[:3, :3].ravel())
+        matter = ""
+        if m > 0:
+            six = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+            matter = f'<inertial mass="{float(m)!r}" pos="{_words(c)}" fullinertia="{_words(six)}"/>'
+        inner = "".join(body(k) for k, row in enumerate(rows) if row[0] == i + 1)
+        place = f'pos="{_words(X[:3, 3])}" quat="{_words(quat)}"'
+        return f'<body {place}><joint type="{kind}" axis="0 0 1"/>{matter}{inner}</body>'
+
+    text = "".join(body(i) for i, row in enumerate(rows) if row[0] == 0)
+    gravity = f'<option gravity="{_words(model.opt.gravity)}"/>'
+    return f'<mujoco model="stripped">{gravity}<worldbody>{text}</worldbody></mujoco>'
+
+
+def _words(numbers):
+    return " ".join(repr(float(x)) for x in numbers)
+
+
+def drake(python, model, q, v, tau):
+    """(ns of a forward dynamics, ns of the calls taken off, accelerations); a sentence when it is refused.
+
+    Drake's free joints: quaternion before position, turning before moving, both in the world.
+    """
+    free = np.flatnonzero(model.jnt_type == 0)
+    turns = {j: [_turn(x[k + 3 : k + 7]) for x in q] for j in free for k in [model.jnt_qposadr[j]]}
+    q, v, tau = q.copy(), v.copy(), tau.copy()
+    for j in free:
+        at, dof = model.jnt_qposadr[j], model.jnt_dofadr[j]
+        q[:, at : at + 7] = np.roll(q[:, at : at + 7], 4, axis=1)
+        for x in (v, tau):
+            turned = np.einsum("nij,nj->ni", turns[j], x[:, dof + 3 : dof + 6])
+            x[:, dof : dof + 6] = np.hstack([turned, x[:, dof : dof + 3]])
+    path, given, result = (DRAKE / name for name in ("model.xml", "states.npz", "result.npz"))
+    path.write_text(_mjcf(model))
+    np.savez(given, q=q, v=v, tau=tau)
+    command = [python, SOURCE.parent / "drake_aba.py", path, given, result]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        return f"absent: {_last_line(done.stderr)}"
+    got = np.load(result)
+    a = got["a"].copy()
+    for j in free:
+        dof = model.jnt_dofadr[j]
+        turned = np.einsum("nji,nj->ni", turns[j], a[:, dof : dof + 3])
+        a[:, dof : dof + 6] = np.hstack([a[:, dof + 3 : dof + 6], turned])
+    return float(got["ns"]), float(got["call_ns"]), a
