@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PARTS = 16  # stretches of added force on the way to the goal
-_SAMPLES, _ROUNDS = 64, 4  # of the cross-entropy method
+_SAMPLES, _ROUNDS, _BRANCHES = 64, 5, 6  # of the cross-entropy method; gains it starts from
 
 
 class Intent(NamedTuple):
@@ -275,17 +275,19 @@ class SwingUp:
         every = self._plain(np.tile(np.arange(k), b), tick)
         none = np.zeros(b * k, dtype=bool)
         since, least, when = self.foresee(np.repeat(q, k, axis=0), np.repeat(v, k, axis=0), every, tick, none)
-        best = np.argmin(np.where(np.isfinite(since), since - 1e12, least).reshape(b, k), axis=1)
-        pick = np.arange(b) * k + best
-        intent = self._plain(best, tick)._replace(arrival=since[pick])
-        lost = np.flatnonzero(~np.isfinite(since[pick]))
-        if len(lost):
-            better = self._corrected(q[lost], v[lost], best[lost], when[pick][lost], tick)
-            rows = np.isfinite(better.arrival)
+        points = np.where(np.isfinite(since), since - 1e12, least).reshape(b, k)
+        order = np.argsort(points, axis=1)[:, :_BRANCHES]
+        intent = self._plain(order[:, 0], tick)._replace(arrival=since[np.arange(b) * k + order[:, 0]])
+        when = when.reshape(b, k)
+        for rank in range(order.shape[1]):
+            lost = np.flatnonzero(~np.isfinite(intent.arrival))
+            if not len(lost):
+                break
+            choice = order[lost, rank]
+            better = self._corrected(q[lost], v[lost], choice, when[lost, choice], tick)
+            use = np.isfinite(better.arrival) | (rank == 0)
             for old, new in zip(intent, better, strict=True):
-                old[lost[rows]] = new[rows]
-            unforeseen = lost[~rows]
-            intent.extra[unforeseen], intent.stretch[unforeseen] = better.extra[~rows], better.stretch[~rows]
+                old[lost[use]] = new[use]
         return intent
 
     def _plain(self, choice: NDArray[np.intp], tick: int) -> Intent:

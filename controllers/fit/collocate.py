@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly, PPoly
 
 from ...models import lookup, name_of
 from ...sim.clip import Clip, Track
@@ -157,7 +157,7 @@ class _Transcription:
         self.strength = np.where(np.isfinite(high), high, np.maximum(weight, 0.1 * weight.max()))
 
     def _functions(self) -> tuple[Any, Any]:
-        """(q, v, tau, f) -> a, and q, v -> (positions, velocities) of the contact sites."""
+        """(q, v, tau, f) -> a, and (q, v, a) -> positions, velocities, accelerations of the contact sites."""
         import casadi as ca
 
         m, smooth = self.machine.model, self.machine.nominal.smooth
@@ -174,8 +174,11 @@ class _Transcription:
             full += ca.jacobian(places, q).T @ f
         forward = smooth.tape("forward").casadi("forward")
         a = forward(q, v, [], ca.DM.zeros(m.nu), full, [], [])
+        rate = ca.SX.sym("a", m.nv)
         speeds = ca.jtimes(places, q, v) if self.sites else ca.SX(0, 1)
-        return ca.Function("a", [q, v, tau, f], [a]), ca.Function("sites", [q, v], [places, speeds])
+        bends = ca.jtimes(speeds, q, v) + ca.jtimes(places, q, rate) if self.sites else ca.SX(0, 1)
+        foot = ca.Function("sites", [q, v, rate], [places, speeds, bends])
+        return ca.Function("a", [q, v, tau, f], [a]), foot
 
     def solve(
         self, true: Machine, effort: float, deviation: float, most: int, start: Fitted | None
@@ -191,39 +194,40 @@ class _Transcription:
         Q, V, T, F = (
             ca.MX.sym(name, size, n) for name, size in (("q", nv), ("v", nv), ("tau", nd), ("f", nf))
         )
-        Tm, Fm = ca.MX.sym("tau_m", nd, n - 1), ca.MX.sym("f_m", nf, n - 1)
-        A = accelerate.map(n)(Q, V, T, F)
+        # forces are straight between nodes, and of a contact there are none beyond its phase
+        on: Any = ca.DM(self._touched.astype(float))
+        T0, T1, F0, F1 = T[:, :-1], T[:, 1:], F[:, :-1] * on, F[:, 1:] * on
+        Tm = 0.5 * (T0 + T1)
+        q0, q1, v0, v1 = Q[:, :-1], Q[:, 1:], V[:, :-1], V[:, 1:]
+        piece = accelerate.map(n - 1)
+        a0, a1 = piece(q0, v0, T0, F0), piece(q1, v1, T1, F1)
         H: Any = ca.DM(h).T
         each: Any = ca.repmat(H, nv, 1)
-        q0, q1, v0, v1, a0, a1 = Q[:, :-1], Q[:, 1:], V[:, :-1], V[:, 1:], A[:, :-1], A[:, 1:]
         qm = 0.5 * (q0 + q1) + each / 8.0 * (v0 - v1)
         vm = 0.5 * (v0 + v1) + each / 8.0 * (a0 - a1)
-        am = accelerate.map(n - 1)(qm, vm, Tm, Fm)
+        am = piece(qm, vm, Tm, 0.5 * (F0 + F1))
         equal = [
             (q1 - q0 - each / 6.0 * (v0 + 4.0 * vm + v1)) / each,
             v1 - v0 - each / 6.0 * (a0 + 4.0 * am + a1),
         ]
         below: list[Any] = []
-        self._machine_limits(below, V, A, am, T, Tm, vm, H)
+        self._machine_limits(below, V, (a0, am, a1), T, Tm, vm, H)
         low, high = self._bounds(n, nd, nf)
-        self._contacts(equal, below, foot, Q, V, F, Fm)
+        self._contacts(equal, below, foot, (Q, V, F), (a0, a1))
         keyed = np.flatnonzero(self.clip.dofs)
         wq = ca.DM(np.gradient(self.t))
         miss = (Q - ca.DM(self.wanted.q.T))[keyed.tolist(), :]
         scale = ca.DM(1.0 / self.strength[self.driven])
-        push, push_m = T * ca.repmat(scale, 1, n), Tm * ca.repmat(scale, 1, n - 1)
+        push = T * ca.repmat(scale, 1, n)
         cost = deviation * ca.dot(ca.sum1(miss**2), wq.T)
-        cost += effort / 6.0 * ca.dot(ca.sum1(push[:, :-1] ** 2 + 4.0 * push_m**2 + push[:, 1:] ** 2), H)
-        for change in (push_m - push[:, :-1], push[:, 1:] - push_m):
-            cost += 1e-3 * effort * ca.sumsqr(change / ca.repmat(ca.sqrt(H), nd, 1))
+        # joints without keys need not move more than the motion asks
+        loose = np.flatnonzero(~self.clip.dofs).tolist()
+        cost += 0.1 * effort * ca.dot(ca.sum1(V[loose, :] ** 2), wq.T)
+        cost += effort * ca.dot(ca.sum1(push**2), wq.T)
+        cost += 1e-4 * effort * ca.sumsqr((push[:, 1:] - push[:, :-1]) / ca.repmat(ca.sqrt(H), nd, 1))
         if nf:
-            cost += (
-                1e-3
-                * effort
-                * (ca.sumsqr(F) + ca.sumsqr(Fm))
-                / max(float(m.body_mass.sum()) * 9.81, 1e-9) ** 2
-            )
-        x = ca.veccat(Q, V, T, F, Tm, Fm)
+            cost += 1e-3 * effort * ca.sumsqr(F) / max(float(m.body_mass.sum()) * 9.81, 1e-9) ** 2
+        x = ca.veccat(Q, V, T, F)
         g = ca.veccat(*equal, *below)
         count = sum(int(e.numel()) for e in equal)
         limits = np.zeros(int(g.numel()))
@@ -249,8 +253,11 @@ class _Transcription:
             raise PantographError(f"no motion was found that fits: constraints are missed {how}; {fix}")
         parts = np.split(np.asarray(done["x"]).ravel(), np.cumsum([nv * n, nv * n, nd * n, nf * n]))
         q, v, tau, f = (p.reshape(n, k) for p, k in zip(parts[:4], (nv, nv, nd, nf), strict=True))
-        a = np.asarray(accelerate.map(n)(q.T, v.T, tau.T, f.T)).T
-        fitted = self._clip(q, v, a)
+        ends = [
+            np.asarray(piece(q[cut].T, v[cut].T, tau[cut].T, f[cut].T * self._touched)).T
+            for cut in (slice(None, -1), slice(1, None))
+        ]
+        fitted = self._clip(q, v, ends[0], ends[1])
         full = np.zeros((n, nv))
         full[:, self.driven] = tau
         limit, missing = self._certify(true, fitted, full, f)
@@ -273,56 +280,56 @@ class _Transcription:
             v_low[k, rows] = v_high[k, rows] = 0.0 if self.at_rest else self.wanted.v[k, rows]
         t_low, t_high = mm.force_low[self.driven], mm.force_high[self.driven]
         f_low, f_high = np.full((n, nf), -np.inf), np.full((n, nf), np.inf)
-        fm_low, fm_high = np.full((n - 1, nf), -np.inf), np.full((n - 1, nf), np.inf)
-        middle = 0.5 * (self.t[1:] + self.t[:-1])
         for k, site in enumerate(self.sites):
             cut = slice(3 * k, 3 * k + 3)
-            for grid, lo, hi in ((self.t, f_low, f_high), (middle, fm_low, fm_high)):
-                free = ~self._touching(site, grid)
-                lo[free, cut], hi[free, cut] = 0.0, 0.0
-        low = [q_low, v_low, np.tile(t_low, (n, 1)), f_low, np.tile(t_low, (n - 1, 1)), fm_low]
-        high = [q_high, v_high, np.tile(t_high, (n, 1)), f_high, np.tile(t_high, (n - 1, 1)), fm_high]
+            free = ~self._touching(site, self.t)
+            f_low[free, cut], f_high[free, cut] = 0.0, 0.0
+        low = [q_low, v_low, np.tile(t_low, (n, 1)), f_low]
+        high = [q_high, v_high, np.tile(t_high, (n, 1)), f_high]
         return np.concatenate([x.ravel() for x in low]), np.concatenate([x.ravel() for x in high])
 
     def _touching(self, site: str, t: Array) -> NDArray[np.bool_]:
-        """Where a site may push: its force grows from zero, and falls to it, as a phase begins and ends, so
-        that the piece on the other side is free of it."""
+        """Whether a site touches at times t (n,)."""
         on = np.zeros(len(t), dtype=bool)
         for p in self.phases:
-            begun = (t > p.start + 1e-9) | (p.start <= self.t[0])
-            on |= (site in p.sites) & begun & ((t < p.stop - 1e-9) | (p.stop >= self.t[-1]))
+            on |= (site in p.sites) & (t >= p.start - 1e-9) & (t <= p.stop + 1e-9)
         return on
+
+    @cached_property
+    def _touched(self) -> NDArray[np.bool_]:
+        """Pieces in which a site pushes, (3 sites, n - 1)."""
+        middle = 0.5 * (self.t[1:] + self.t[:-1])
+        rows = [self._touching(site, middle) for site in self.sites for _ in range(3)]
+        return np.array(rows, dtype=bool).reshape(3 * len(self.sites), len(middle))
 
     def _guess(self, n: int, nf: int, low: Array, high: Array, start: Fitted | None) -> Array:
         """The last solution on this grid, or the keys with the forces they would need."""
         if start is not None:
             q, v, _ = start.clip.evaluate(self.t)
-            rows = [self.t, 0.5 * (self.t[1:] + self.t[:-1])]
-            tau, tau_m = (_between(start.t, start.tau[:, self.driven], t) for t in rows)
-            f, f_m = (_between(start.t, start.contact, t) for t in rows)
-            last = np.concatenate([p.ravel() for p in (q, v, tau, f, tau_m, f_m)])
+            forces = [_between(start.t, x, self.t) for x in (start.tau[:, self.driven], start.contact)]
+            last = np.concatenate([p.ravel() for p in (q, v, *forces)])
             return np.asarray(np.clip(last, low, high))
         tau = self.machine.nominal.smooth.inverse(*self.wanted)[:, self.driven]
         f = np.zeros((n, nf))
         weight = 9.81 * float(self.machine.model.body_mass.sum())
         for k, site in enumerate(self.sites):
             f[self._touching(site, self.t), 3 * k + 2] = weight / len(self.sites)
-        parts = [self.wanted.q, self.wanted.v, tau, f, 0.5 * (tau[1:] + tau[:-1]), 0.5 * (f[1:] + f[:-1])]
+        parts = [self.wanted.q, self.wanted.v, tau, f]
         return np.asarray(np.clip(np.concatenate([p.ravel() for p in parts]), low, high))
 
     def _machine_limits(
-        self, below: list[Any], V: Any, A: Any, am: Any, T: Any, Tm: Any, vm: Any, H: Any
+        self, below: list[Any], V: Any, A: tuple[Any, Any, Any], T: Any, Tm: Any, vm: Any, H: Any
     ) -> None:
         """Rows <= 0 for what bounds of single variables do not say."""
         import casadi as ca
 
         mm = self.machine
         for dof in np.flatnonzero(np.isfinite(mm.acceleration)):
-            for a in (A[int(dof), :], am[int(dof), :]):
+            for a in (a[int(dof), :] for a in A):
                 below += [a / float(mm.acceleration[dof]) - 1.0, -a / float(mm.acceleration[dof]) - 1.0]
         for dof in np.flatnonzero(np.isfinite(mm.jerk)):
-            a, middle = A[int(dof), :], am[int(dof), :]
-            for change in (middle - a[:-1], a[1:] - middle):
+            first, middle, last = (a[int(dof), :] for a in A)
+            for change in (middle - first, last - middle):
                 jerk = 2.0 * change / H / float(mm.jerk[dof])
                 below += [jerk - 1.0, -jerk - 1.0]
         for k, dof in enumerate(self.driven):
@@ -335,47 +342,40 @@ class _Transcription:
             below += [each @ ca.sqrt(x**2 + 1e-12) - 1.0 for x in (T, Tm)]
 
     def _contacts(
-        self, equal: list[Any], below: list[Any], foot: Any, Q: Any, V: Any, F: Any, Fm: Any
+        self, equal: list[Any], below: list[Any], foot: Any, state: tuple[Any, Any, Any], a: tuple[Any, Any]
     ) -> None:
-        """Sites that touch rest, and push within their cone."""
-        middle = 0.5 * (self.t[1:] + self.t[:-1])
+        """Sites that touch come to rest where their phase begins, and are not accelerated in it.
+
+        The condition on accelerations decides the contact force at every node; conditions on positions or
+        velocities at every node would leave it to swing from one to the next.
+        """
+        Q, V, F = state
         weight = 9.81 * float(self.machine.model.body_mass.sum())
         for phase in self.phases:
             on = np.flatnonzero((self.t >= phase.start - 1e-9) & (self.t <= phase.stop + 1e-9)).tolist()
-            between = np.flatnonzero((middle > phase.start) & (middle < phase.stop)).tolist()
+            rests = self.at_rest and on[-1] == len(self.t) - 1
             for site in phase.sites:
                 k = self.sites.index(site)
-                first = None
                 for i in on:
-                    p, speed = foot(Q[:, i], V[:, i])
-                    p, speed = p[3 * k : 3 * k + 3], speed[3 * k : 3 * k + 3]
-                    if first is None and phase.ground is not None and i > 0:
-                        equal.append(p[2] - phase.ground)
-                    first = i
-                    if i > 0 and not (self.at_rest and i == len(self.t) - 1):
-                        # planar models cannot move a site across their plane: that row would say 0 = 0
-                        equal.append(speed[[0, 2]])
-                for forces, rows in ((F, on), (Fm, between)):
-                    for i in rows:
-                        x, y, z = (forces[3 * k + j, i] / weight for j in range(3))
-                        # the pyramid inside of the cone: linear, and smooth where nothing pushes
-                        below += [sx * x + sy * y - phase.friction * z for sx in (1, -1) for sy in (1, -1)]
+                    now = a[0][:, i] if i < on[-1] else a[1][:, i - 1]
+                    p, speed, bend = (x[3 * k : 3 * k + 3] for x in foot(Q[:, i], V[:, i], now))
+                    if i == on[0] and i > 0:  # the pose at the start is given
+                        equal += [] if phase.ground is None else [p[2] - phase.ground]
+                        # rest at the end follows from rest here, and would be asked for twice
+                        equal += [] if rests else [speed[[0, 2]]]
+                    equal.append(bend[[0, 2]] / 9.81)
+                    x, y, z = (F[3 * k + j, i] / weight for j in range(3))
+                    # the pyramid inside of the cone: linear, and smooth where nothing pushes
+                    below += [sx * x + sy * y - phase.friction * z for sx in (1, -1) for sy in (1, -1)]
 
-    def _clip(self, q: Array, v: Array, a: Array) -> Clip:
-        """Quintics through position, velocity and acceleration at the nodes: twice differentiable."""
-        m, tracks = self.machine.model, {}
+    def _clip(self, q: Array, v: Array, a0: Array, a1: Array) -> Clip:
+        """Quintics through position, velocity and, from each side, acceleration at the nodes."""
+        m, tracks, t = self.machine.model, {}, frozen(self.t)
+        powers = _quintic(np.diff(self.t)[:, None], (q[:-1], v[:-1], a0), (q[1:], v[1:], a1))
         for joint in range(m.njnt):
             dof = int(m.jnt_dofadr[joint])
-            rows = np.stack([q[:, dof], v[:, dof], a[:, dof]], axis=1)
-            powers = _quintic(self.t, rows)
-            tracks[name_of(m, "joint", joint)] = PolynomialCurve(
-                frozen(self.t),
-                frozen(q[:, [dof]]),
-                frozen(self.t),
-                "hold",
-                "hold",
-                frozen(powers[:, :, None]),
-            )
+            track = PolynomialCurve(t, frozen(q[:, [dof]]), t, "hold", "hold", frozen(powers[:, :, [dof]]))
+            tracks[name_of(m, "joint", joint)] = track
         return Clip(self.clip.model, dict[str, Track](tracks), self.clip.q0)
 
     def _certify(self, machine: Machine, clip: Clip, tau: Array, f: Array) -> tuple[float, float]:
@@ -383,10 +383,12 @@ class _Transcription:
         fine = np.interp(np.arange(10 * (len(self.t) - 1) + 1) / 10.0, np.arange(len(self.t)), self.t)
         motion = clip.evaluate(fine)
         need = machine.nominal.smooth.inverse(*motion)
-        given = _between(self.t, f, fine)
         largest = max(float(np.abs(need).max()), 1e-12)
         if f.shape[1]:
-            need = need - self._pushed(motion.q, given)
+            piece = np.minimum(np.arange(len(fine)) // 10, len(self.t) - 2)
+            part = ((fine - self.t[piece]) / np.diff(self.t)[piece])[:, None]
+            given = (1.0 - part) * f[piece] + part * f[piece + 1]
+            need = need - self._pushed(motion.q, given * self._touched.T[piece])
         missing = float(np.abs(need[:, ~machine.driven]).max(initial=0.0)) / largest
         kinematic = replace(machine, driven=np.zeros_like(machine.driven), current=np.inf)
         worst = check_motion(fine, motion, kinematic, keyed=np.ones(len(tau[0]), dtype=bool)).worst
@@ -421,6 +423,11 @@ def _between(t: Array, rows: Array, at: Array) -> Array:
     return out
 
 
-def _quintic(t: Array, rows: Array) -> Array:
-    """Coefficients (6, n - 1), highest first, of quintics through (q, v, a) (n, 3) at times t (n,)."""
-    return np.asarray(PPoly.from_bernstein_basis(BPoly.from_derivatives(t, rows)).c)
+def _quintic(h: Array, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Array:
+    """Coefficients (6, n, k), highest first, of quintics over lengths h (n, 1) with q, v, a at both ends."""
+    (q0, v0, a0), (q1, v1, a1) = start, end
+    d, e, g = q1 - q0 - h * v0 - 0.5 * h**2 * a0, v1 - v0 - h * a0, a1 - a0
+    c3 = 10.0 * d / h**3 - 4.0 * e / h**2 + 0.5 * g / h
+    c4 = -15.0 * d / h**4 + 7.0 * e / h**3 - g / h**2
+    c5 = 6.0 * d / h**5 - 3.0 * e / h**4 + 0.5 * g / h**3
+    return np.stack([c5, c4, c3, 0.5 * a0, v0, q0])
