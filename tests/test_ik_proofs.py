@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from oracles import ik_cases, ik_planar
-from pantograph.sim.ik import Position, solve
+from pantograph.sim.ik import Distance, PointOnLine, PointOnPlane, Position, solve
 from pantograph.sim.ik.chains.closed_form import closed_form
 from pantograph.sim.ik.pose import Kinematics
 from pantograph.sim.ik.problem import Problem
@@ -64,6 +64,12 @@ def test_no_proof_excludes_what_some_configuration_has(model, seed):
     for site in sites:
         p, quat = ik_cases.pose_of(model, q, site)
         goals.append(ik_cases.Pose(site, p, quat) if rng.random() < 0.5 else Position(site, p))
+    p, x = ik_cases.pose_of(model, q, sites[0])[0], rng.normal(size=3)
+    across = np.cross(rng.normal(size=3), x)
+    others = [PointOnPlane(sites[0], p + across, x), PointOnLine(sites[0], p + x, x)]
+    others.append(Distance(sites[0], p + x, float(np.linalg.norm(x))))
+    for goal in others:
+        assert goal_gap(Problem(model, [goal], space), goal, start).position < 1e-7
     problem = Problem(model, goals, space)
     for goal in goals:
         gap = goal_gap(problem, goal, start)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from pantograph.sim.ik import Distance, JointValue, Orientation, Pose, Position
+from pantograph.sim.ik import Distance, JointValue, Orientation, PointOnLine, PointOnPlane, Pose, Position
 
 from . import ik_planar as planar
 
@@ -226,6 +226,21 @@ def beyond_sphere(rng):
     return Case("outside the sphere", model, [goal], "out of reach", float(truth))
 
 
+def beyond_surface(rng):
+    """Two bones from a ball joint, and a plane or a line farther away than they are long."""
+    a, b = rng.uniform(0.2, 1.0, 2)
+    shoulder, gap, normal = rng.normal(size=3) * 0.3, rng.uniform(1e-3, 1), unit(rng)
+    links = [
+        ([0, 0, 0], BALL, (0, 0, 1), None),
+        ([a, 0, 0], HINGE, (0, 1, 0), None),
+        ([b, 0, 0], None, None, None),
+    ]
+    aside = np.cross(normal, unit(rng))
+    point = shoulder + (a + b + gap) * normal + aside * rng.normal()
+    goal = PointOnPlane("tip", point, normal) if rng.random() < 0.5 else PointOnLine("tip", point, aside)
+    return Case("beyond a surface", chain(links, base=shoulder), [goal], "out of reach", float(gap))
+
+
 def beyond_tilt(rng):
     """A planar arm asked for a tilted orientation: the tilt of its axis remains."""
     lengths = rng.uniform(0.2, 1.0, int(rng.integers(2, 5)))
@@ -425,7 +440,7 @@ def conflict_beside_an_innocent_goal(rng):
 
 REACHABLE = (reachable_pose, reachable_point, reachable_at_limit, reachable_stretched, reachable_wrist,
              reachable_several)  # fmt: skip
-BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt)
+BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt, beyond_surface)
 LIMITED = (
     limited_two_links,
     limited_three_links,
