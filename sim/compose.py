@@ -33,6 +33,7 @@ LAWS: dict[str, Callable[[], Callable[..., Law]]] = {
     "impedance": _law("impedance", "Impedance"),
     "lqr": _law("lqr", "LQR"),
     "swing-up": _law("swing_up", "SwingUp"),
+    "nmpc": _law("predictive.nonlinear", "NMPC"),
 }
 
 

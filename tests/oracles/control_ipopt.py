@@ -1,0 +1,51 @@
+"""The problem of a nonlinear MPC formulated plainly: multiple shooting over RK4 in CasADi, by IPOPT."""
+
+import casadi as ca
+import numpy as np
+
+
+def formulate(law):
+    """A solver (x0, reference states, reference forces, guess) -> (forces, cost) of an NMPC's problem."""
+    model, n, h, m = law.model, law.n, law.step, len(law.inputs)
+    nv = model.nv
+    x, u = ca.SX.sym("x", 2 * nv), ca.SX.sym("u", m)
+    tau = ca.SX.zeros(nv)
+    for k, dof in enumerate(law.inputs):
+        tau[int(dof)] = u[k]
+    forward = law.nominal.smooth.tape("forward").casadi("forward")
+
+    def rate(x):
+        return ca.vertcat(x[nv:], forward(x[:nv], x[nv:], [], ca.DM.zeros(model.nu), tau, [], []))
+
+    k1 = rate(x)
+    k2 = rate(x + h / 2 * k1)
+    k3 = rate(x + h / 2 * k2)
+    k4 = rate(x + h * k3)
+    step = ca.Function("step", [x, u], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    X, U = ca.MX.sym("X", 2 * nv, n + 1), ca.MX.sym("U", m, n)
+    start, Xr, Ur = ca.MX.sym("x0", 2 * nv), ca.MX.sym("Xr", 2 * nv, n + 1), ca.MX.sym("Ur", m, n)
+    dx, du = X - Xr, U - Ur
+    cost = ca.dot(ca.DM(law.Q), ca.sum2(dx[:, :-1] ** 2)) + ca.dot(ca.DM(law.R), ca.sum2(du**2))
+    cost += dx[:, -1].T @ ca.DM(law.final) @ dx[:, -1]
+    for dof in np.flatnonzero(np.isfinite(law.q_high)):
+        over = (
+            ca.fmax(X[int(dof), :] - law.q_high[dof], 0) ** 2
+            + ca.fmax(law.q_low[dof] - X[int(dof), :], 0) ** 2
+        )
+        cost += law.soft[dof] * ca.sum2(over)
+    g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U))
+    problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur), "f": cost, "g": g}
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
+    solver = ca.nlpsol("mpc", "ipopt", problem, options)
+    free = np.full(2 * nv * (n + 1), np.inf)
+    low = np.concatenate([-free, np.tile(law.low, n)])
+    high = np.concatenate([free, np.tile(law.high, n)])
+
+    def solve(x0, ref, guess_x, guess_u):
+        p = np.concatenate([x0, ref.x.ravel(), ref.u.ravel()])
+        guess = np.concatenate([guess_x.ravel(), guess_u.ravel()])
+        done = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=0, ubg=0)
+        u = np.asarray(done["x"]).ravel()[2 * nv * (n + 1) :].reshape(n, m)
+        return u, float(done["f"])
+
+    return solve
