@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from control_figures import Figure, at_least, at_most, info
 from control_fit import PARTS as FIT
+from control_mpc import PARTS as MPC
 from pantograph.controllers.basin import Catch, map_basin, picture
 from pantograph.controllers.design import LinearSystem, dlqr, held, lqr
 from pantograph.controllers.experiments import compare
@@ -167,7 +168,7 @@ def robust(console: Console) -> list[Figure]:
     ]
 
 
-PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **FIT}
+PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **FIT, **MPC}
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from control_figures import Figure, at_most, info
-from pantograph.controllers.fit import machine, retime
+from pantograph.controllers.fit import fit, machine, prove, retime
 from pantograph.models import ModelError, load_model
 from pantograph.sim.clip import Clip
 from pantograph.sim.curves import keyed
@@ -82,4 +82,35 @@ def retiming(console: Console) -> list[Figure]:
     return figures
 
 
-PARTS = {"retiming": retiming}
+def fitting(console: Console) -> list[Figure]:
+    """Impossible keys made possible: a pick at a torque limit, an acrobot's swing; certified, simulated."""
+    arm, acrobot = load_model("planar_2r"), load_model("acrobot")
+    up = {
+        "shoulder": keyed([0, 4], [0, np.pi], kind="clamped"),
+        "elbow": keyed([0, 4], [0, 0], kind="clamped"),
+    }
+    pick = {"shoulder": keyed([0, 0.5, 1], [-1.2, 0.3, 0.8], kind="clamped")}
+    pick["elbow"] = keyed([0, 0.5, 1], [0.5, 1.8, 0.2], kind="clamped")
+    weak = machine(arm, force={"shoulder": 85.0, "elbow": 25.0})
+    free = machine(acrobot, driven=np.array([False, True]), force={"elbow": 15.0})
+    cases = {
+        "pick at a torque limit": (Clip(arm, pick, arm.qpos0), weak, {"hard": [1.0]}),
+        "swing of the acrobot": (Clip(acrobot, up, acrobot.qpos0), free, {"hard": [4.0], "deviation": 0.1}),
+    }
+    figures = []
+    for name, (clip, able, words) in cases.items():
+        begun = time.perf_counter()
+        found = fit(clip, able, **words)
+        seconds = time.perf_counter() - begun
+        proof = prove(found, able)
+        console.print(f"{name}: {found.certificate}")
+        figures += [
+            at_most(f"{name}: share of limits in use, grid x 10", found.certificate.limits, 1.001, ""),
+            at_most(f"{name}: force missing, relative", found.certificate.dynamics, 1e-3, ""),
+            at_most(f"{name}: simulated with LQR, largest error", proof.worst, 0.01, "rad"),
+            info(f"{name}: time of the fit", seconds, "s"),
+        ]
+    return figures
+
+
+PARTS = {"retiming": retiming, "fitting": fitting}
