@@ -92,6 +92,18 @@ def test_one_call_and_a_batch_agree_and_repeat():
         np.testing.assert_array_equal(arm(R[i], p[i]).q[0], batch.q[i])
 
 
+def test_joints_without_limits_stay_within_half_a_turn_of_the_seed():
+    rng = np.random.default_rng(0)
+    links = [(0.3 * rng.normal(size=3), ik_cases.HINGE, ik_cases.unit(rng), None) for _ in range(6)]
+    model = ik_cases.chain([*links, ([0.1, 0.2, 0.1], None, None, None)])
+    X = frame(model, "site", "tip").pose(rng.uniform(-np.pi, np.pi, (50, 6)))
+    raced = ChainSolver(model, "tip")(X[:, :3, :3], X[:, :3, 3])
+    assert raced.met.all()
+    assert np.abs(raced.q).max() <= np.pi
+    position, _ = _errors(model, "tip", raced.q, X[:, :3, :3], X[:, :3, 3])
+    assert position.max() < 3e-6
+
+
 def test_the_seed_is_tried_first():
     model = load_model("arm6")
     arm = ChainSolver(model, "tip")

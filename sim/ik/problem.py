@@ -165,7 +165,7 @@ def freedom_names(model: mujoco.MjModel, mask: NDArray[np.bool_]) -> tuple[str, 
 
 
 def unwound(problem: Problem, q: Array, to: Array) -> Array:
-    """`q` (n, nq) with whole turns of hinges undone towards `to`, where the goals stay met."""
+    """`q` (n, nq) with whole turns of hinges undone towards `to`, where that changes no residual."""
     near = problem.space.nearest_turns(q, to)
-    met = problem.met(problem.raw(near).r)
-    return np.where(met[:, None], near, q)
+    change = np.abs(problem.raw(near).r - problem.raw(q).r).max(axis=1, initial=0.0)
+    return np.where((change < 1e-9)[:, None], near, q)

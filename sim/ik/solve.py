@@ -80,7 +80,7 @@ def solve(
     q = diagnosis.nearest
     if wished is not None and any(g.weight is None for g in problem.goals):
         q = nearest.q[0] if q is None else q
-    answer = nearest.q[0] if q is None else q
+    answer = unwound(judged, nearest.q if q is None else q[None], start)[0]
     return _solution(
         problem, answer, diagnosis.verdict, answer[:0].reshape(0, 0), diagnosis.q_free, search, begin
     )

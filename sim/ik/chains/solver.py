@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ... import rotations
 from ...errors import ModelError
+from ...kinds import HINGE
 from ...kinematics import Frame
 from ..goals import BAND, Orientation, Pose, Position
 from ..pose import Kinematics, parse_frame
@@ -126,14 +127,17 @@ class ChainSolver:
         scale = max(0.5 * sum(float(np.linalg.norm(x)) for x in offsets), 1e-3)
         self.chain = Chain(frame, _limits(space, frame), position, rotation, scale)
         self.columns = np.array([j.q for j in frame.joints])
+        hinges = np.array([int(j.type) == HINGE for j in frame.joints])
+        self._endless = hinges & ~np.isfinite(self.chain.limits).any(axis=1)
         self.racer = _compiled(self.chain.fingerprint(), self.chain)
 
     @property
     def middle(self) -> Array:
         """Mid-range configuration (n,); the reference where a joint has no limits."""
         rest = np.array([j.rest for j in self.chain.frame.joints])
-        mean = self.chain.limits.mean(axis=1)
-        return np.where(np.isfinite(mean), mean, rest)
+        bounded = np.isfinite(self.chain.limits).all(axis=1)
+        low, high = np.where(bounded[:, None], self.chain.limits, 0.0).T
+        return np.where(bounded, 0.5 * (low + high), rest)
 
     def __call__(
         self,
@@ -145,5 +149,9 @@ class ChainSolver:
         most: int = 8000,
     ) -> Raced:
         """Joint values (k, n) for R (k, 3, 3), p (k, 3) [m]; `tolerance` of every component [m, rad]."""
-        start = self.middle if seed is None else seed
-        return self.racer(start, R, p, tolerance=(tolerance, tolerance), most=most)
+        start = np.asarray(self.middle if seed is None else seed, dtype=float)
+        raced = self.racer(start, R, p, tolerance=(tolerance, tolerance), most=most)
+        if not self._endless.any():
+            return raced
+        turns = 2 * np.pi * np.round((raced.q - start) / (2 * np.pi))
+        return raced._replace(q=raced.q - turns * self._endless)
