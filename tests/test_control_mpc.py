@@ -38,10 +38,10 @@ PEERS = {law: formulate(law) for law in (CART, ARM)}
 @settings(max_examples=8)
 def test_the_plan_is_the_optimum_that_ipopt_finds(law, seed):
     rng, nv = np.random.default_rng(seed), 2
-    ref = law.horizon(0.1)
+    ref = law.horizon(0.107)
     x0 = ref.x[0] + rng.uniform(-0.4, 0.4, 2 * nv)
     u = np.clip(ref.u, law.low, law.high)
-    x, u, cost = law.improve(law.rollout(x0, u), u, ref, 200)
+    x, u, cost = law.improve(law.rollout(x0, u, ref), u, ref, 200)
     theirs_u, theirs = PEERS[law](x0, ref, x, u)
     assert cost <= theirs * (1 + 1e-6) + 1e-9
     np.testing.assert_allclose(u, theirs_u, atol=2e-3 * (law.high - law.low).max())
@@ -53,12 +53,12 @@ def test_the_plan_is_the_optimum_that_ipopt_finds(law, seed):
 @settings(max_examples=10)
 def test_near_the_goal_it_is_lqr(seed):
     law, rng = cart(), np.random.default_rng(seed)
-    x = 1e-5 * rng.normal(size=4)
+    x = 1e-3 * rng.normal(size=4)
     tau, _ = law(0.0, x[:2], x[2:], STILL, law.start())
-    A, B = (m[0] for m in law.derivatives(np.zeros((1, 4)), np.zeros((1, 1))))
+    A, B = (m[0] for m in law.derivatives(np.zeros((1, 4)), np.zeros((1, 1)), np.array([law.step])))
     P = law.final
     K = np.linalg.solve(np.diag(law.R) + B.T @ P @ B, B.T @ P @ A)
-    assert tau[0] == pytest.approx(float(-K[0] @ x), rel=1e-4, abs=1e-9)
+    assert tau[0] == pytest.approx(float(-K[0] @ x), rel=1e-3, abs=1e-9)
     assert tau[1] == 0.0
 
 
@@ -67,8 +67,11 @@ def test_near_the_goal_it_is_lqr(seed):
 def test_derivatives_of_a_step_are_its_differences(seed):
     rng, law, eps = np.random.default_rng(seed), ARM, 1e-6
     x, u = rng.normal(size=4), 10 * rng.normal(size=2)
-    A, B = law.derivatives(x[None], u[None])
-    for matrix, base, f in ((A[0], x, lambda z: law._advance(z, u)), (B[0], u, lambda z: law._advance(x, z))):
+    A, B = law.derivatives(x[None], u[None], np.array([0.02]))
+    for matrix, base, f in (
+        (A[0], x, lambda z: law._advance(z, u, 0.02)),
+        (B[0], u, lambda z: law._advance(x, z, 0.02)),
+    ):
         for j in range(len(base)):
             step = eps * np.eye(len(base))[j]
             np.testing.assert_allclose(matrix[:, j], (f(base + step) - f(base - step)) / (2 * eps), atol=1e-6)

@@ -40,10 +40,15 @@ class PlanMemory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """References of a prediction: x (n + 1, 2 nv) and u (n, m)."""
+    """References of a prediction: x (n + 1, 2 nv), u (n, m), and the lengths h (n,) [s] of its steps.
+
+    Steps end on a grid that does not move with time, so that a plan goes on unchanged from sample to sample;
+    the first step is what is left of the one in progress.
+    """
 
     x: Array
     u: Array
+    h: Array
 
 
 class NMPC:
@@ -52,7 +57,8 @@ class NMPC:
     Looks ``horizon`` [s] ahead in steps of ``step`` [s]; the cost per second is that of LQR: ``position``,
     ``velocity`` and ``force`` weights on deviations from the keys (``goal`` for joints without: joint ->
     value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one costs ``soft``
-    times the position weight. Each sample makes ``iterations`` improvements. Hinges and slides,
+    times the position weight. The first sample plans until nothing is left to gain, each later one makes
+    ``iterations`` improvements. Hinges and slides,
     no keyed joints.
     """
 
@@ -123,25 +129,27 @@ class NMPC:
 
     def horizon(self, t: float) -> Horizon:
         """References from time ``t`` [s] on."""
-        times = t + self.step * np.arange(self.n + 1)
-        q, v, _ = self.clip.evaluate(times)
+        gone = self._step_of(t)
+        ends = np.concatenate([[t], (gone + 1 + np.arange(self.n)) * self.step])
+        middle = self.clip.evaluate(0.5 * (ends[1:] + ends[:-1]))
+        q, v, _ = self.clip.evaluate(ends)
         for column, value in self.unkeyed.items():
-            q[:, column] = value
-        middle = self.clip.evaluate(times[:-1] + 0.5 * self.step)
-        q_mid = middle.q
-        for column, value in self.unkeyed.items():
-            q_mid[:, column] = value
-        tau = self.nominal.smooth.inverse(q_mid, middle.v, middle.a)
-        return Horizon(np.hstack([q, v]), tau[:, self.inputs])
+            q[:, column] = middle.q[:, column] = value
+        tau = self.nominal.smooth.inverse(middle.q, middle.v, middle.a)
+        return Horizon(np.hstack([q, v]), tau[:, self.inputs], np.diff(ends))
+
+    def _step_of(self, t: float) -> int:
+        """Index of the step of the grid in which ``t`` lies."""
+        return int(np.floor(t / self.step + 1e-6))
 
     # ---- one plan
 
-    def rollout(self, x: Array, u: Array) -> Array:
-        """States (n + 1, 2 nv) from x (2 nv,) under forces (n, m)."""
+    def rollout(self, x: Array, u: Array, ref: Horizon) -> Array:
+        """States (n + 1, 2 nv) from x (2 nv,) under forces (n, m) over the steps of ``ref``."""
         out = np.empty((len(u) + 1, len(x)))
         out[0] = x
         for k in range(len(u)):
-            out[k + 1] = self._advance(out[k], u[k])
+            out[k + 1] = self._advance(out[k], u[k], ref.h[k])
         return out
 
     def cost(self, x: Array, u: Array, ref: Horizon) -> float:
@@ -149,23 +157,26 @@ class NMPC:
         nv = self.model.nv
         dx, du = x - ref.x, u - ref.u
         beyond = np.maximum(x[:, :nv] - self.q_high, 0.0) + np.maximum(self.q_low - x[:, :nv], 0.0)
-        total = float(np.sum(dx[:-1] ** 2 @ self.Q) + np.sum(du**2 @ self.R) + dx[-1] @ self.final @ dx[-1])
+        share = ref.h / self.step
+        total = float(share @ (dx[:-1] ** 2 @ self.Q + du**2 @ self.R) + dx[-1] @ self.final @ dx[-1])
         return total + float(np.sum(beyond**2 @ self.soft))
 
     def improve(self, x: Array, u: Array, ref: Horizon, iterations: int) -> tuple[Array, Array, float]:
         """A better plan: states, forces, cost. Stops early when nothing is left to gain."""
         cost, damping = self.cost(x, u, ref), 0.0
         for _ in range(iterations):
-            A, B = self.derivatives(x[:-1], u)
+            A, B = self.derivatives(x[:-1], u, ref.h)
             change, K, gain = self._backward(x, u, ref, A, B, damping)
-            if gain <= 1e-12 * (1e-12 + cost):
+            if gain <= 1e-9 * (1e-9 + cost):
                 break
             for share in (1.0, 0.5, 0.2, 0.05):
-                new_x, new_u = self._forward(x, u, change, K, share)
+                new_x, new_u = self._forward(x, u, ref, change, K, share)
                 new = self.cost(new_x, new_u, ref)
-                if new < cost:
-                    break
+                if new < cost or gain <= 1e-6 * cost:
+                    break  # better, or so near the optimum that rounding decides
             if not new < cost:
+                if gain <= 1e-6 * cost:
+                    break
                 if damping > 1e6:
                     break
                 damping = max(10.0 * damping, 1e-4 * float(np.trace(self.final)))
@@ -176,21 +187,21 @@ class NMPC:
                 break
         return x, u, cost
 
-    def derivatives(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """A (n, 2 nv, 2 nv) and B (n, 2 nv, m) of one step from states (n, 2 nv): RK4 by the chain rule."""
-        nv, h, m = self.model.nv, self.step, len(self.inputs)
+    def derivatives(self, x: Array, u: Array, lengths: Array) -> tuple[Array, Array]:
+        """A (n, 2 nv, 2 nv) and B (n, 2 nv, m) of steps (n,) from states (n, 2 nv): RK4 by the chain rule."""
+        nv, h, m = self.model.nv, lengths[:, None], len(self.inputs)
         tau = np.zeros((len(x), nv))
         tau[:, self.inputs] = u
         D0 = np.zeros((len(x), 2 * nv, 2 * nv + m))
         D0[:, range(2 * nv), range(2 * nv)] = 1.0
         total, k, D = D0.copy(), np.zeros_like(x), np.zeros_like(D0)
         for c, b in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
-            xs, Ds = x + c * h * k, D0 + c * h * D
+            xs, Ds = x + c * h * k, D0 + c * h[:, None] * D
             d = self.nominal.smooth.derivatives(xs[:, :nv], xs[:, nv:], tau=tau)
             k = np.hstack([xs[:, nv:], d.a])
             D = np.concatenate([Ds[:, nv:], d.dq @ Ds[:, :nv] + d.dv @ Ds[:, nv:]], axis=1)
             D[:, nv:, 2 * nv :] += d.dtau[:, :, self.inputs]
-            total += b * h * D
+            total += b * h[:, None] * D
         return total[:, :, : 2 * nv], total[:, :, 2 * nv :]
 
     def _backward(
@@ -199,8 +210,8 @@ class NMPC:
         """Changes (n, m) of the forces and gains (n, m, 2 nv), within the limits, and the gain to expect."""
         nv = self.model.nv
         over = np.maximum(x[:, :nv] - self.q_high, 0.0) - np.maximum(self.q_low - x[:, :nv], 0.0)
-        grad = (x - ref.x) * self.Q
-        curve = np.tile(self.Q, (len(x), 1))
+        part = np.append(ref.h, self.step)[:, None] / self.step
+        grad, curve = (x - ref.x) * self.Q * part, self.Q * part
         grad[:, :nv] += over * self.soft
         curve[:, :nv] += (over != 0) * self.soft
         Vx, Vxx = self.final @ (x[-1] - ref.x[-1]), self.final.copy()
@@ -208,15 +219,15 @@ class NMPC:
         Vxx[range(nv), range(nv)] += (over[-1] != 0) * self.soft
         change, gains = np.empty_like(u), np.empty((len(u), u.shape[1], 2 * nv))
         m, expected = u.shape[1], 0.0
-        heavy = np.diag(self.R + damping)
-        push = (u - ref.u) * self.R
+        heavy = part[:-1, :, None] * np.diag(self.R) + damping * np.eye(m)
+        push = (u - ref.u) * self.R * part[:-1]
         low, high = self.low - u, self.high - u
         F = np.concatenate([A, B], axis=2)
         diagonal = range(2 * nv)
         for k in range(len(u) - 1, -1, -1):
             f = F[k]
             W, w = f.T @ (Vxx @ f), f.T @ Vx
-            Qu, Quu, Qux = push[k] + w[-m:], heavy + W[-m:, -m:], W[-m:, :-m]
+            Qu, Quu, Qux = push[k] + w[-m:], heavy[k] + W[-m:, -m:], W[-m:, :-m]
             d, K = _boxed(Quu, Qu, Qux, low[k], high[k])
             Qxx = W[:-m, :-m]
             Qxx[diagonal, diagonal] += curve[k]
@@ -227,18 +238,20 @@ class NMPC:
             expected -= float(d @ (2.0 * Qu + Quu @ d))
         return change, gains, expected
 
-    def _forward(self, x: Array, u: Array, change: Array, K: Array, share: float) -> tuple[Array, Array]:
+    def _forward(
+        self, x: Array, u: Array, ref: Horizon, change: Array, K: Array, share: float
+    ) -> tuple[Array, Array]:
         new_x, new_u = np.empty_like(x), np.empty_like(u)
         new_x[0] = x[0]
         for k in range(len(u)):
             raw = u[k] + share * change[k] + K[k] @ (new_x[k] - x[k])
             new_u[k] = np.minimum(np.maximum(raw, self.low), self.high)
-            new_x[k + 1] = self._advance(new_x[k], new_u[k])
+            new_x[k + 1] = self._advance(new_x[k], new_u[k], ref.h[k])
         return new_x, new_u
 
-    def _advance(self, x: Array, u: Array) -> Array:
+    def _advance(self, x: Array, u: Array, h: float) -> Array:
         """One RK4 step of one state."""
-        f, nv, h = self._rate, self.model.nv, self.step
+        f, nv = self._rate, self.model.nv
         at_q, at_v, a = f.inputs["q"], f.inputs["v"], f.outputs["a"]
         f.inputs["tau"][self.inputs] = u
         q, v = x[:nv], x[nv:]
@@ -272,19 +285,16 @@ class NMPC:
         ref = self.horizon(t)
         first = np.isnan(memory.t)
         u = np.clip(ref.u if first else self._shifted(memory, t), self.low, self.high)
-        x = self.rollout(np.concatenate([q, v]), u)
-        x, u, cost = self.improve(x, u, ref, 20 if first else self.iterations)
+        x = self.rollout(np.concatenate([q, v]), u, ref)
+        x, u, cost = self.improve(x, u, ref, 300 if first else self.iterations)
         tau = np.zeros(self.model.nv)
         tau[self.inputs] = u[0]
         return tau, PlanMemory(t, u, cost)
 
     def _shifted(self, memory: PlanMemory, t: float) -> Array:
-        """The last plan as it goes on from ``t`` [s], held at its end."""
-        at = np.arange(self.n) + (t - memory.t) / self.step
-        low = np.minimum(at.astype(np.intp), self.n - 1)
-        high = np.minimum(low + 1, self.n - 1)
-        part = (at - np.floor(at))[:, None]
-        return np.asarray((1.0 - part) * memory.u[low] + part * memory.u[high])
+        """The last plan as it goes on from ``t`` [s], its last force held."""
+        passed = self._step_of(t) - self._step_of(memory.t)
+        return memory.u[np.minimum(np.arange(self.n) + passed, self.n - 1)]
 
 
 def _boxed(H: Array, g: Array, G: Array, low: Array, high: Array) -> tuple[Array, Array]:

@@ -51,11 +51,11 @@ def run(console: Console, name: str, law: NMPC, x: np.ndarray, seconds: float) -
         if k % 10 == 5:
             ref = law.horizon(t)
             guess = np.clip(law._shifted(before, t), law.low, law.high)
-            path = law.rollout(x, guess)
+            path = law.rollout(x, guess, ref)
             begun = time.perf_counter()
             peer(x, ref, path, guess)
             theirs.append(time.perf_counter() - begun)
-            best = law.improve(law.rollout(x, memory.u), memory.u.copy(), ref, 200)[2]
+            best = law.improve(law.rollout(x, memory.u, ref), memory.u.copy(), ref, 200)[2]
             ratios.append((memory.cost + 1e-6) / (best + 1e-6))
         q, v = advance(law.nominal, q[None], v[None], tau[None], period / 4, 4)
         x = np.concatenate([q[0], v[0]])

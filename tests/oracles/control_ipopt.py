@@ -6,7 +6,7 @@ import numpy as np
 
 def formulate(law):
     """A solver (x0, reference states, reference forces, guess) -> (forces, cost) of an NMPC's problem."""
-    model, n, h, m = law.model, law.n, law.step, len(law.inputs)
+    model, n, m, h = law.model, law.n, len(law.inputs), ca.SX.sym("h")
     nv = model.nv
     x, u = ca.SX.sym("x", 2 * nv), ca.SX.sym("u", m)
     tau = ca.SX.zeros(nv)
@@ -21,11 +21,13 @@ def formulate(law):
     k2 = rate(x + h / 2 * k1)
     k3 = rate(x + h / 2 * k2)
     k4 = rate(x + h * k3)
-    step = ca.Function("step", [x, u], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    step = ca.Function("step", [x, u, h], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
     X, U = ca.MX.sym("X", 2 * nv, n + 1), ca.MX.sym("U", m, n)
-    start, Xr, Ur = ca.MX.sym("x0", 2 * nv), ca.MX.sym("Xr", 2 * nv, n + 1), ca.MX.sym("Ur", m, n)
+    start, Xr, Ur, H = (
+        ca.MX.sym(*a) for a in (("x0", 2 * nv), ("Xr", 2 * nv, n + 1), ("Ur", m, n), ("h", 1, n))
+    )
     dx, du = X - Xr, U - Ur
-    cost = ca.dot(ca.DM(law.Q), ca.sum2(dx[:, :-1] ** 2)) + ca.dot(ca.DM(law.R), ca.sum2(du**2))
+    cost = ca.dot(ca.DM(law.Q).T @ dx[:, :-1] ** 2 + ca.DM(law.R).T @ du**2, H) / law.step
     cost += dx[:, -1].T @ ca.DM(law.final) @ dx[:, -1]
     for dof in np.flatnonzero(np.isfinite(law.q_high)):
         over = (
@@ -33,8 +35,8 @@ def formulate(law):
             + ca.fmax(law.q_low[dof] - X[int(dof), :], 0) ** 2
         )
         cost += law.soft[dof] * ca.sum2(over)
-    g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U))
-    problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur), "f": cost, "g": g}
+    g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U, H))
+    problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur, H), "f": cost, "g": g}
     options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
     solver = ca.nlpsol("mpc", "ipopt", problem, options)
     free = np.full(2 * nv * (n + 1), np.inf)
@@ -42,7 +44,7 @@ def formulate(law):
     high = np.concatenate([free, np.tile(law.high, n)])
 
     def solve(x0, ref, guess_x, guess_u):
-        p = np.concatenate([x0, ref.x.ravel(), ref.u.ravel()])
+        p = np.concatenate([x0, ref.x.ravel(), ref.u.ravel(), ref.h])
         guess = np.concatenate([guess_x.ravel(), guess_u.ravel()])
         done = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=0, ubg=0)
         u = np.asarray(done["x"]).ravel()[2 * nv * (n + 1) :].reshape(n, m)
