@@ -282,7 +282,10 @@ def test_ctrl_c_keeps_what_was_recorded(folder, engine):
         time.sleep(patience)
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        try:
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
         r = load(folder / "out" / "long.npz") if (folder / "out").exists() else None
         if r is not None and len(r.t) > 1:
             break
