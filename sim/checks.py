@@ -18,13 +18,7 @@ def check_frames(setup: Setup, t: Array, q: Array) -> list[str]:
     """Sentences about overlaps and crossed limits that the run did not prevent; empty when there are none."""
     if not len(t):
         return []
-    return _limits(setup, t, q) + _overlaps(setup, t, q) + _goals(setup, t, q)
-
-
-def _goals(setup: Setup, t: Array, q: Array) -> list[str]:
-    from .scene.goals import sentences
-
-    return sentences(setup.scene, setup.model, t, q) if setup.scene.goals else []
+    return _limits(setup, t, q) + _overlaps(setup, t, q)
 
 
 def _limits(setup: Setup, t: Array, q: Array) -> list[str]:

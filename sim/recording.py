@@ -66,7 +66,8 @@ class Recording:
     t (n,) [s]; q (n, nq), v (n, nv), a (n, nv) in MuJoCo's coordinates [m, rad]; tau (n, nv) drive
     forces [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,) sum of contact normal forces
     [N]; keyed, tracked (nv,) masks; tick_t (m,), tick_ctrl (m, nu), tick_qfrc (m, nv): the controller's
-    samples, held in between. ``status`` is 'done', 'diverged' or 'interrupted'. Arrays are read-only.
+    samples, held in between; missed (n, goals, 2): distance [m] and angle [rad] from each of ``goals``.
+    ``status`` is 'done', 'diverged' or 'interrupted'. Arrays are read-only.
     """
 
     t: Array
@@ -78,6 +79,8 @@ class Recording:
     kinetic: Array
     potential: Array
     normal: Array
+    goals: tuple[str, ...]
+    missed: Array
     keyed: NDArray[np.bool_]
     tracked: NDArray[np.bool_]
     tick_t: Array
@@ -206,7 +209,7 @@ def _unpack(arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> Recordin
     if error is not None:
         error = ErrorEstimate(angle=arrays.pop("error_angle"), length=arrays.pop("error_length"), **error)
     header["events"] = tuple(Event(*e) for e in header["events"])
-    header["notes"] = tuple(header["notes"])
+    header["notes"], header["goals"] = tuple(header["notes"]), tuple(header["goals"])
     parts: dict[str, Any] = {**arrays, **header}
     return Recording(**parts, model_bytes=model_bytes, error=error)
 

@@ -15,9 +15,10 @@ from .checks import check_frames
 from .compose import make_engine, make_law
 from .control import Sampled
 from .engines.derive import derive
-from .engines.interface import Controls, Role
+from .engines.interface import Array, Controls, Role, Segment
 from .plan import Plan, make_plan
 from .recording import Recording, model_to_bytes
+from .scene.build import Setup
 from .scene.load import load_scene
 from .scene.schema import Scene
 
@@ -44,9 +45,12 @@ def run(
     controls = _controls(plan)
     segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
     status, message, estimate, notes = segment.status, segment.message, None, [_UNCHECKED]
+    missed: dict[str, Array] = {}
     try:
         derived = derive(problem, segment)
         notes = check_frames(setup, segment.t, segment.q)
+        missed = _missed(setup, segment)
+        notes += _sentences(missed, segment.t)
         if error and status == "done" and segment.stats["steps"]:
             estimate = estimate_error(engine, problem, segment, derived.events, plan.period)
     except KeyboardInterrupt:
@@ -78,7 +82,26 @@ def run(
         versions=_versions(),
         model_bytes=model_to_bytes(problem.model),
         error=estimate,
+        goals=tuple(missed),
+        missed=np.stack([*missed.values()], axis=1) if missed else np.zeros((len(segment.t), 0, 2)),
     )
+
+
+def _missed(setup: Setup, segment: Segment) -> dict[str, Array]:
+    """How far the motion is from the scene's goals: by goal, (n, 2) [m], [rad]."""
+    if not (setup.scene.goals and len(segment.t)):
+        return {}
+    from .scene.goals import deviations
+
+    return deviations(setup.scene, setup.model, segment.t, segment.q)
+
+
+def _sentences(missed: dict[str, Array], t: Array) -> list[str]:
+    if not missed:
+        return []
+    from .scene.goals import sentences
+
+    return sentences(missed, t)
 
 
 def _controls(plan: Plan) -> Controls | None:

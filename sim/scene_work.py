@@ -54,7 +54,7 @@ class SceneSteps:
         controls = None
         if plan.period is not None:
             item = plan.setup.scene.controller
-            law = make_law(item.law if item else "pd", problem, item.parameters if item else {})
+            law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, plan.period)
             controls = Sampled(law, problem, plan.period)
         engine: Engine = SmoothEngine() if self.engine == "smooth" else ContactEngine()
         segment = engine.run(problem, (0.0, case.duration), controls)

@@ -28,6 +28,7 @@ def test_the_recorded_motion_goes_where_the_goals_say():
     s = 3 * recording.t**2 - 2 * recording.t**3  # clamped spline through two keys
     np.testing.assert_allclose(p[:, 1], -0.1 + 0.2 * s, atol=1e-4)
     told = deviations(_scene(), recording.model, recording.t, recording.q)["position tip"]
+    np.testing.assert_array_equal(recording.missed[:, recording.goals.index("position tip")], told)
     truth = np.stack([np.full_like(s, 0.45), -0.1 + 0.2 * s, 0.4 + 0.1 * s], axis=1)
     np.testing.assert_allclose(told[:, 0], np.linalg.norm(p - truth, axis=1), atol=1e-12)
     assert any("position tip" in note for note in recording.notes)

@@ -57,7 +57,7 @@ def assert_identical(one, other):
 
 
 def test_a_run_is_loaded_as_it_was_saved(recording, saved, tmp_path):
-    assert len(ARRAYS) == 14
+    assert len(ARRAYS) == 15
     (tmp_path / "r.npz").write_bytes(saved)
     assert_identical(recording, load(tmp_path / "r.npz"))
 

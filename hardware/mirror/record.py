@@ -271,6 +271,8 @@ def _recording(
         kinetic=kinetic,
         potential=potential,
         normal=np.zeros(len(t)),
+        goals=(),
+        missed=np.zeros((len(t), 0, 2)),
         keyed=np.zeros(model.nv, dtype=bool),
         tracked=tracked,
         tick_t=np.zeros(0),

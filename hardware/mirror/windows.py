@@ -48,7 +48,7 @@ def windows(plan: Plan) -> Iterator[Window]:
     controls: Controls | None = None
     if plan.period is not None:
         item = plan.setup.scene.controller
-        law = make_law(item.law if item else "pd", problem, item.parameters if item else {})
+        law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, plan.period)
         controls = Sampled(law, problem, plan.period)
     state, step = problem.state0, 0
     while step < problem.steps:

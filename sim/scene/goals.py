@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import mujoco
@@ -129,10 +129,10 @@ def deviations(scene: Scene, model: mujoco.MjModel, t: Array, q: Array) -> dict[
     return {label: np.array(rows) for label, rows in out.items()}
 
 
-def sentences(scene: Scene, model: mujoco.MjModel, t: Array, q: Array) -> list[str]:
-    """A sentence for every goal: how far the motion is from it at most, and when."""
+def sentences(missed: Mapping[str, Array], t: Array) -> list[str]:
+    """A sentence for every goal of `deviations`: how far the motion is from it at most, and when."""
     out = []
-    for label, rows in deviations(scene, model, t, q).items():
+    for label, rows in missed.items():
         k = int(np.argmax(rows.sum(axis=1)))
         far = " and ".join(
             f"{x:.3g} {unit}" for x, unit in zip(rows[k], ("m", "rad"), strict=True) if x > 1e-6

@@ -135,7 +135,7 @@ class ChainSolver:
     def middle(self) -> Array:
         """Mid-range configuration (n,); the reference where a joint has no limits."""
         rest = np.array([j.rest for j in self.chain.frame.joints])
-        bounded = np.isfinite(self.chain.limits).all(axis=1)
+        bounded = np.asarray(np.isfinite(self.chain.limits).all(axis=1))
         low, high = np.where(bounded[:, None], self.chain.limits, 0.0).T
         return np.where(bounded, 0.5 * (low + high), rest)
 
