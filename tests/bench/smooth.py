@@ -35,7 +35,8 @@ ROLLOUT_BARS = {  # one state, batch of 4096: steps per second and core over muj
     "humanoid": (3.5, 12),
 }
 SPAN = 5.0  # of the motions whose error is bought [s]
-GRID = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256, 512, 1024, 2048])  # steps, in hundreds
+FRAMES = 25  # of the motions, where every engine's error is looked at
+STEPS = FRAMES * np.unique(np.round(2.0 ** np.arange(1.0, 13.01, 0.25)).astype(int))  # tried by every engine
 DERIVATIVE_BARS = {"ur5": 8, "panda": 3, "quadruped": 2.5, "humanoid": 1}
 
 
@@ -278,8 +279,10 @@ def to_an_error():
         model = models.stripped(models.load(name))
         smooth = compile_model(model)
         q, v = np.linspace(0.5, 1.5, model.nq), np.zeros(model.nv)
-        times = np.linspace(0.0, SPAN, 101)
-        exact = smooth.rollout(q, v, step=SPAN / 2e4, steps=20000, every=200, method=TABLEAUS["verner98"]).q
+        times = np.linspace(0.0, SPAN, FRAMES + 1)
+        exact = smooth.rollout(
+            q, v, step=SPAN / 2e4, steps=20000, every=20000 // FRAMES, method=TABLEAUS["verner98"]
+        ).q
         check = smooth.integrate(q, v, times, method=TABLEAUS["dop853"], rtol=1e-13, atol=1e-13).q
         theirs = _mujoco_costs(model, q, v, exact)
         ours = _our_costs(smooth, q, v, times, exact)
@@ -320,8 +323,8 @@ def _mujoco_costs(model, q, v, exact):
     start = np.concatenate([[0.0], q, v])[None]
     for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST", "RK4", "DISCRETE"):
         model.opt.integrator = int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}"))
-        for steps in 100 * GRID:  # MuJoCo records every step
-            if integrator != "RK4" and steps > 100 * 2**10:
+        for steps in STEPS:  # MuJoCo records every step
+            if integrator != "RK4" and steps > FRAMES * 2**11:
                 continue
             model.opt.timestep = SPAN / steps
             data = mujoco.MjData(model)
@@ -329,7 +332,7 @@ def _mujoco_costs(model, q, v, exact):
             def call(data=data, steps=steps):
                 return rollout(model, data, start, nstep=steps, control=None)[0]
 
-            path = call()[0, steps // 100 - 1 :: steps // 100, 1 : 1 + model.nq]
+            path = call()[0, steps // FRAMES - 1 :: steps // FRAMES, 1 : 1 + model.nq]
             error = np.abs(path - exact[1:]).max()
             out.append((f"MuJoCo {integrator} {steps} steps", error, _cpu(call, rounds=3)))
             if error < 1e-10:
@@ -342,12 +345,12 @@ def _our_costs(smooth, q, v, times, exact):
     out = []
     x, u = np.concatenate([q, v]), np.zeros(smooth.layout.nu)
     for name, method in TABLEAUS.items():
-        steps = 100 * GRID[GRID < 1000] if method.order > 2 else []
+        steps = STEPS[STEPS < 1e5] if method.order > 2 else []
         stepper = Stepper(smooth, method, int(max(steps, default=1)))
         for n in steps:
 
             def fixed(stepper=stepper, n=int(n)):
-                return stepper(x, u, n, SPAN / n)[:: n // 100].copy()
+                return stepper(x, u, n, SPAN / n)[:: n // FRAMES].copy()
 
             error = np.abs(fixed()[:, : len(q)] - exact).max()
             out.append((f"{name} {n} steps", error, _cpu(fixed)))
