@@ -163,7 +163,7 @@ def test_mistakes_are_told(clip, words, message):
 
 def test_the_command_checks_retimes_and_fits(tmp_path):
     import typer
-    from pantograph.controllers.cli import fit as command
+    from pantograph.controllers.fit.command import fit as command
 
     app = typer.Typer()
     app.command()(command)

@@ -31,7 +31,8 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'p
 
 def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
-    from ...controllers.cli import control, fit
+    from ...controllers.cli import control
+    from ...controllers.fit.command import fit
     from ...hardware.cli import app as servo
     from .ik import ik
 
