@@ -225,7 +225,7 @@ class Pose(Goal):
 
 @dataclass(frozen=True, eq=False)
 class LookAt(Goal):
-    """The local `axis` of `at` points to the world point `target`.
+    """The local `axis` of `at` points to the point `target` (3,) [m] of the world, or of `relative_to`.
 
     Residual: difference of the unit vectors of axis and sight, 2 sin(angle / 2) long.
     """
@@ -233,6 +233,7 @@ class LookAt(Goal):
     at: str
     target: ArrayLike
     axis: ArrayLike = (0.0, 0.0, 1.0)
+    relative_to: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -240,7 +241,7 @@ class LookAt(Goal):
         object.__setattr__(self, "axis", _unit("axis", self.axis))
 
     def frames(self) -> tuple[str, ...]:
-        return (self.at,)
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
     def units(self) -> tuple[Unit, ...]:
         return ("rad",) * 3
@@ -248,10 +249,14 @@ class LookAt(Goal):
     def rows(self, c: Configurations) -> Rows:
         f = c.frame(self.at)
         a = f.R @ np.asarray(self.axis)
-        sight = np.asarray(self.target) - f.p
+        sight, J = np.asarray(self.target) - f.p, -f.Jv
+        if self.relative_to is not None:
+            b = c.frame(self.relative_to)
+            arm = b.R @ np.asarray(self.target)
+            sight, J = b.p + arm - f.p, b.Jv - rotations.skew(arm) @ b.Jw - f.Jv
         far = np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         d = sight / far
-        Jd = -(f.Jv - d[:, :, None] * (d[:, None, :] @ f.Jv)) / far[:, :, None]
+        Jd = (J - d[:, :, None] * (d[:, None, :] @ J)) / far[:, :, None]
         return Rows(a - d, -rotations.skew(a) @ f.Jw - Jd)
 
     def errors(self, r: Array) -> tuple[Array, Array]:
@@ -343,9 +348,13 @@ class Distance(Goal):
 
 @dataclass(frozen=True, eq=False)
 class Mirror(Goal):
-    """The origin of `at` is the mirror image of that of `of` in the plane through `point` along `normal`.
+    """`at` is the mirror image of `of` in the plane through `point` along `normal`.
 
     With `relative_to`, the plane is fixed in that frame, so that a limb mirrors another on a turned trunk.
+    `what`: its origin ("position"), how it is turned ("orientation"), or both ("pose"). The image of a frame
+    has left-handed axes; its `flip` axis, in axes of the frame, is turned around to make them right-handed:
+    R_at = S R_of S_flip with S_n = 1 - 2 n n^T. Default `flip`: the normal, for frames whose axes are those
+    of the plane's frame where limbs hang at rest.
     """
 
     at: str
@@ -353,21 +362,41 @@ class Mirror(Goal):
     normal: ArrayLike = (0.0, 1.0, 0.0)
     point: ArrayLike = (0.0, 0.0, 0.0)
     relative_to: str | None = None
+    what: Literal["position", "orientation", "pose"] = "position"
+    flip: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "normal", _unit("normal", self.normal))
         object.__setattr__(self, "point", vector("point", self.point))
+        object.__setattr__(self, "flip", self.normal if self.flip is None else _unit("flip", self.flip))
+        if self.what not in ("position", "orientation", "pose"):
+            raise ModelError(f"a mirror is of the position, the orientation or the pose, not {self.what!r}")
 
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.of) if self.relative_to is None else (self.at, self.of, self.relative_to)
 
     def units(self) -> tuple[Unit, ...]:
-        return ("m",) * 3
+        place: tuple[Unit, ...] = ("m",) * 3
+        turn: tuple[Unit, ...] = ("rad",) * 3
+        return {"position": place, "orientation": turn, "pose": place + turn}[self.what]
 
     def rows(self, c: Configurations) -> Rows:
         f, g = (_seen_from(c, at, self.relative_to) for at in (self.at, self.of))
-        n = np.asarray(self.normal)
-        S = np.eye(3) - 2 * np.outer(n, n)
-        image = (g.p - np.asarray(self.point)) @ S + np.asarray(self.point)
-        return Rows(f.p - image, f.Jv - S @ g.Jv)
+        S, point = _reflection(np.asarray(self.normal)), np.asarray(self.point)
+        place = Rows(f.p - (g.p - point) @ S - point, f.Jv - S @ g.Jv)
+        if self.what == "position":
+            return place
+        image = S @ g.R @ _reflection(np.asarray(self.flip))
+        back = image.transpose(0, 2, 1)
+        phi = rotations.log(rotations.from_matrix(back @ f.R))
+        # a mirrored turn goes the other way around the mirrored axis: S [w] S = [-S w]
+        turn = Rows(phi, rotations.inverse_right_jacobian(-phi) @ (back @ (f.Jw + S @ g.Jw)))
+        if self.what == "orientation":
+            return turn
+        return Rows(np.concatenate([place.r, turn.r], axis=1), np.concatenate([place.J, turn.J], axis=1))
+
+
+def _reflection(n: Array) -> Array:
+    """1 - 2 n n^T: mirror in the plane along the unit vector n."""
+    return np.asarray(np.eye(3) - 2 * np.outer(n, n))

@@ -6,7 +6,9 @@
            Faverjon & Tournassoud 1987)
 
 A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick
-has a velocity that does, too, so that ranges, velocities and accelerations never contradict each other.
+has a velocity that does, too, so that ranges, velocities and accelerations never contradict each other. With
+the same law joints slow down before the configuration that meets the goals, relative to how that moves: a
+goal that jumps is approached without overshoot.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ _CLOSE = 1e-20
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 4  # linearisations a tick
+_STRIDE = 0.5  # [rad or m] of one of them in search of where to brake
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,10 @@ class Follower:
         self.q = self.space.check(model.qpos0 if q0 is None else q0)
         self.v: Array = np.zeros(model.nv)
         self._damping = _LEAST
+        self._aim: Array | None = (
+            None  # (nq,) configuration that meets the last goals, and its velocity (nv,)
+        )
+        self._aim_v: Array = np.zeros(model.nv)
         self.v_max, self.a_max = (
             limit("velocity", velocity, model.nv),
             limit("acceleration", acceleration, model.nv),
@@ -100,6 +107,7 @@ class Follower:
         problem = Problem(self.model, goals, self.space, joints=self.joints, kinematics=self.kinematics)
         columns = np.flatnonzero(problem.moved)
         before, low, high = self.q, *self._box()
+        low, high = self._braked(problem, low, high)
         d: Array = np.zeros(self.model.nv)
         allowed = self._allowed()
         d = np.clip(d, low, high)
@@ -169,6 +177,52 @@ class Follower:
         x[self.space.scalar_v] = self.q[self.space.scalar_q]
         return step_box(self.space.low - x, self.space.high - x, self.v, self.v_max, self.a_max, self.dt)
 
+    def _braked(self, problem: Problem, low: Array, high: Array) -> tuple[Array, Array]:
+        """Steps (nv,) between `low` and `high` after which joints can still stop where the goals are met."""
+        if not np.isfinite(self.a_max[problem.moved]).any():
+            return low, high
+        away, speed = self._seek(problem)
+        a = np.where(problem.moved, self.a_max, np.inf)
+        gap = away - speed * self.dt  # left when the goals' own motion is taken off
+        most = self.dt * (speed + _braking(np.maximum(gap, 0.0), a, self.dt))
+        least = self.dt * (speed - _braking(np.maximum(-gap, 0.0), a, self.dt))
+        if self.apart is not None:  # the way around a geom leads away from the goal
+            most, least = np.where(gap > 0, most, high), np.where(gap < 0, least, low)
+        bounded = np.isfinite(a)
+        return (
+            np.where(bounded, np.clip(least, low, high), low),
+            np.where(bounded, np.clip(most, low, high), high),
+        )
+
+    def _seek(self, problem: Problem) -> tuple[Array, Array]:
+        """Way (nv,) from here to a configuration that meets the goals, and the velocity (nv,) it has."""
+        last = self._aim
+        aim = self.q if last is None else np.where(self.space.coordinates(problem.moved), last, self.q)
+        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
+        w, damping = problem.weighted(problem.raw(aim[None])), _LEAST * _HARD
+        for _ in range(_ITERATIONS):
+            r, J = w.r[0] * weight, w.J[0] * weight[:, None]
+            cost, slope = float(r @ r), J.T @ r
+            if cost < _CLOSE * _HARD:
+                break
+            inside = self.space.free_directions(aim[None], slope[None])[0][0]
+            free = np.flatnonzero(problem.moved & inside)
+            d: Array = np.zeros(self.model.nv)
+            d[free] = -np.linalg.solve(J[:, free].T @ J[:, free] + damping * np.eye(len(free)), slope[free])
+            trial = self.space.step(aim[None], np.clip(d, -_STRIDE, _STRIDE)[None])[0]
+            w_trial = problem.weighted(problem.raw(trial[None]))
+            better = float(np.sum((w_trial.r[0] * weight) ** 2)) < cost
+            damping = max(damping * (0.1 if better else 100.0), _LEAST * _HARD)
+            aim, w = (trial, w_trial) if better else (aim, w)
+        moved: Array = np.zeros(self.model.nv)
+        if last is not None:
+            moved = self.space.difference(aim[None], last[None])[0] / self.dt * problem.moved
+        # a goal that jumped has no velocity; one that goes on has that of the last two ticks
+        steady = np.abs(moved - self._aim_v) <= np.minimum(self.a_max, 1e6) * self.dt * (1 + 1e-9)
+        speed = np.where(steady & (np.abs(moved) <= self.v_max), moved, 0.0)
+        self._aim, self._aim_v = aim, moved
+        return self.space.difference(aim[None], self.q[None])[0], speed
+
     def _allowed(self) -> list[float]:
         """Least distance of every pair of geoms after this tick (velocity damper)."""
         if self.apart is None:
@@ -209,11 +263,7 @@ def step_box(
     """Least and greatest step (nv,) with limits `below` <= 0 <= `above` away (see the module's text)."""
 
     def braking(room: Array) -> Array:
-        room = np.maximum(room, 0.0)
-        bounded = np.isfinite(a_max) & np.isfinite(room)
-        a, s = np.where(bounded, a_max, 1.0), np.where(bounded, room, 0.0)
-        speed = a * (np.sqrt(dt * dt + 2 * s / a) - dt)
-        return np.where(bounded, speed, room / dt)
+        return _braking(np.maximum(room, 0.0), a_max, dt)
 
     high = np.minimum(np.minimum(v_max, v + a_max * dt), braking(above))
     low = np.maximum(np.maximum(-v_max, v - a_max * dt), -braking(-below))
@@ -222,6 +272,14 @@ def step_box(
         0.5 * (np.where(empty, low, 0.0) + np.where(empty, high, 0.0)), -braking(-below), braking(above)
     )
     return np.where(empty, middle, low) * dt, np.where(empty, middle, high) * dt
+
+
+def _braking(room: Array, a_max: Array, dt: float) -> Array:
+    """Greatest velocities (nv,) that can be braked within `room` (nv,) from the next tick on."""
+    bounded = np.isfinite(a_max) & np.isfinite(room)
+    a, s = np.where(bounded, a_max, 1.0), np.where(bounded, room, 0.0)
+    speed = a * (np.sqrt(dt * dt + 2 * s / a) - dt)
+    return np.where(bounded, speed, room / dt)
 
 
 def frozen(x: Array) -> Array:
