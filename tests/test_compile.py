@@ -126,28 +126,44 @@ def test_equal_work_is_done_once():
     assert tape.counts == {"sub": 1, "mul": 3, "neg": 2, "inv": 1, "add": 1, "sin": 1}
 
 
-@needs_long_double
-@pytest.mark.parametrize("lanes", [1, 4, 8])
-def test_sine_and_cosine_are_accurate_to_rounding(lanes):
-    graph = Graph()
-    (x,) = graph.inputs("x", 1)
-    program = compiled(Tape.build({"x": 1}, {"y": [g.sin(x), g.cos(x)]}), lanes)
+def awkward_angles():
+    """Angles of all sizes, quarter turns, and their neighbourhoods."""
     rng = np.random.default_rng(0)
     quarters = np.arange(-2000, 2000) * (np.pi / 2)
     near = quarters + rng.normal(size=quarters.size) * 10.0 ** rng.uniform(-16, 0, quarters.size)
-    angles = np.concatenate(
+    return np.concatenate(
         [rng.uniform(-4, 4, 20000), rng.uniform(-1e6, 1e6, 20000), quarters, near, [0.0, 1e-300]]
     )
+
+
+@needs_long_double
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("lanes", [1, 4, 8])
+def test_sine_and_cosine_are_accurate_to_rounding(lanes, fused, monkeypatch):
+    if fused and not emission.fused():
+        pytest.skip("this processor has no fused multiply-add")
+    monkeypatch.setattr(emission, "fused", lambda: fused)
+    graph = Graph()
+    (x,) = graph.inputs("x", 1)
+    program = compiled(Tape.build({"x": 1}, {"y": [g.sin(x), g.cos(x)]}), lanes)
+    angles = awkward_angles()
     got = program([angles[:, None]], len(angles), 1)[0]
     exact = np.stack([np.sin(LONG(1) * angles), np.cos(LONG(1) * angles)], axis=1)
     assert np.abs(got - exact).max() < 1.25e-16
-    small = np.abs(angles) < 1e-3
-    assert (
-        np.abs(got[small, 0] / np.where(exact[small, 0] == 0, 1, exact[small, 0]) - 1)[
-            angles[small] != 0
-        ].max()
-        < 3e-16
-    )
+    small = (np.abs(angles) < 1e-3) & (angles != 0)
+    assert np.abs(got[small, 0] / exact[small, 0] - 1).max() < 3e-16
+
+
+@needs_long_double
+@pytest.mark.parametrize("count", [2, 3, 5, 9, 17])  # the last two are too long to be inlined
+def test_sines_of_one_state_are_computed_side_by_side(count):
+    graph = Graph()
+    x = graph.inputs("x", count)
+    program = compiled(Tape.build({"x": count}, {"y": [f(a) for a in x for f in (g.sin, g.cos)]}), 1)
+    angles = np.random.default_rng(1).permutation(awkward_angles())[: 2000 * count].reshape(-1, count)
+    got = program([angles], len(angles), 1)[0].reshape(-1, count, 2)
+    exact = np.stack([np.sin(LONG(1) * angles), np.cos(LONG(1) * angles)], axis=2)
+    assert np.abs(got - exact).max() < 1.25e-16
 
 
 @needs_long_double

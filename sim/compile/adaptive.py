@@ -13,7 +13,7 @@ from typing import Any
 
 from .llvm import Emitter
 from .loops import Block, function
-from .rollout import CONTROL_ARGUMENTS, Control, Shape, combine, normalize, splat
+from .rollout import CONTROL_ARGUMENTS, Control, Shape, advance, combine, normalize, splat
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 8.0
 OK, TOO_MANY_STEPS, STEP_TOO_SMALL = 0.0, 1.0, 2.0
@@ -229,7 +229,7 @@ class _Integrator:
 
     def write(self, lane: str, time: str) -> None:
         """One state of one lane: y + h theta sum_i P_i(2 theta - 1) k_i (see `tableau.Dense`)."""
-        e, s, nx = self.e, self.e.scalar(), self.shape.nx
+        e, s, nx = self.e, self.e.sharing(1), self.shape.nx
         t = s.emit(f"load double, ptr {s.element(self.mem['t'], lane, 'double')}, align 8")
         h = s.emit(f"load double, ptr {s.element(self.mem['h'], lane, 'double')}, align 8")
         theta = s.f("fdiv", s.f("fsub", time, t), h)
@@ -284,7 +284,7 @@ class _Integrator:
             for i in range(1, self.stages):
                 self.stage(i, method.A[i], h)
             terms = [(float(b), k) for b, k in zip(method.b, self.K, strict=False) if b != 0.0]
-            combine(e, self.XN, self.X, h, terms, self.shape.nx)
+            advance(e, self.XN, self.X, h, terms, self.shape.nx)
             normalize(e, self.XN, self.shape.quaternions)
             accept = self.judge(h, active)
             if not method.fsal:

@@ -34,6 +34,11 @@ def preferred_lanes() -> int:
     return 4 if "+avx" in features else 2
 
 
+def fused() -> bool:
+    """Whether this processor multiplies and adds in one operation with one rounding."""
+    return "+fma" in host()[2].split(",")
+
+
 def llvm_version() -> str:
     """LLVM's version with llvmlite's."""
     import llvmlite
@@ -65,7 +70,7 @@ def compile_ir(kernels: str, loops: str, *, inline: bool) -> bytes:
 
     module, body = llvm.parse_assembly(loops), llvm.parse_assembly(kernels)
     if inline:
-        module.link_in(body)
+        _link_inlined(module, body)
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)
     tuning.slp_vectorization = tuning.loop_vectorization = False
     machine = target_machine(2 if inline else 1)
@@ -75,6 +80,16 @@ def compile_ir(kernels: str, loops: str, *, inline: bool) -> bytes:
         module.link_in(body)
     code: bytes = machine.emit_object(module)
     return code
+
+
+def _link_inlined(module: Any, body: Any) -> None:
+    """Each call of a kernel becomes the kernel itself, so that states stay in registers between calls."""
+    names = [function.name for function in body.functions if not function.is_declaration]
+    module.link_in(body)
+    for name in names:
+        function = module.get_function(name)
+        function.linkage = "internal"
+        function.add_function_attribute("alwaysinline")
 
 
 @dataclass(frozen=True)

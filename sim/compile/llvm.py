@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, ROUND, SIN, SQRT, SUB
+from .jit import fused, preferred_lanes
 from .tape import Tape
 
 _SIN = (
@@ -45,6 +46,7 @@ _ATAN_Q = (
     1.945506571482613964425e2,
 )
 _HALF_PI = (1.57079625129699707031e0, 7.54978941586159635336e-8, 5.39030285815811905290e-15)
+_HALF_PI_FUSED = (1.5707963267948966, 6.123233995736766e-17)
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to an integer
 _MORE_BITS = 6.123233995736765886130e-17  # pi/2 beyond double precision
 
@@ -80,9 +82,9 @@ class Emitter:
         self._count += 1
         return f"{prefix}{self._count}"
 
-    def scalar(self) -> Emitter:
-        """Writer of scalar instructions into the same function."""
-        other = Emitter(1)
+    def sharing(self, lanes: int) -> Emitter:
+        """Writer of instructions on so many lanes into the same function."""
+        other = Emitter(lanes)
         other.lines, other.fresh, other.label = self.lines, self.fresh, self.label  # type: ignore[method-assign]
         return other
 
@@ -218,8 +220,12 @@ class Emitter:
         quarter = self.bits(shifted)
         turns = self.emit(f"fsub {self.V} {shifted}, {self.const(_ROUND)}")
         r = x
-        for part in _HALF_PI:
-            r = self.f("fsub", r, self.f("fmul", turns, self.const(part)))
+        if fused():  # the first product is exact inside the operation, and so is the difference
+            for part in _HALF_PI_FUSED:
+                r = self.call("fma", turns, self.const(-part), r)
+        else:
+            for part in _HALF_PI:
+                r = self.f("fsub", r, self.f("fmul", turns, self.const(part)))
         z = self.f("fmul", r, r)
         zz = self.f("fmul", z, z)
         sine = self.f("fadd", self.f("fmul", self.f("fmul", r, z), self.pairwise(_SIN, z, zz)), r)
@@ -236,6 +242,24 @@ class Emitter:
         s = self.bits(self.select(swap, cosine, sine))
         c = self.bits(self.select(swap, sine, cosine))
         return self.value(self.i("xor", s, sign_s)), self.value(self.i("xor", c, sign_c))
+
+    def side_by_side(self, angles: list[str]) -> list[tuple[str, str]]:
+        """Sines and cosines of many angles of one state, several in one vector."""
+        if self.lanes > 1 or len(angles) == 1:
+            return [self.sincos(x) for x in angles]
+        out: list[tuple[str, str]] = []
+        most = preferred_lanes()
+        for first in range(0, len(angles), most):
+            group = angles[first : first + most]
+            wide = self.sharing(max(2, 1 << (len(group) - 1).bit_length()))
+            vector = "poison"
+            for lane, x in enumerate(group):
+                vector = self.emit(f"insertelement {wide.V} {vector}, double {x}, i64 {lane}")
+            sine, cosine = wide.sincos(vector)
+            for lane in range(len(group)):
+                s, c = (self.emit(f"extractelement {wide.V} {x}, i64 {lane}") for x in (sine, cosine))
+                out.append((s, c))
+        return out
 
     def atan2(self, y: str, x: str) -> str:
         """Angle of the point (x, y)."""
@@ -263,14 +287,15 @@ class Emitter:
         return self.call("copysign", angle, y)
 
 
-DECLARED = {"sqrt": 1, "fabs": 1, "rint": 1, "copysign": 2}
+DECLARED = {"sqrt": 1, "fabs": 1, "rint": 1, "copysign": 2, "fma": 3}
 
 
 def declarations(lanes: int) -> str:
-    """Intrinsics that kernels on `lanes` may call."""
-    e = Emitter(lanes)
+    """Intrinsics that kernels on `lanes` may call; scalar ones use vectors as well (`side_by_side`)."""
+    writers = [Emitter(width) for width in ((1, 2, 4, 8) if lanes == 1 else (lanes,))]
     return "\n".join(
         f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity)})"
+        for e in writers
         for name, arity in DECLARED.items()
     )
 
@@ -278,6 +303,7 @@ def declarations(lanes: int) -> str:
 _BINARY = {ADD: "fadd", SUB: "fsub", MUL: "fmul"}
 
 
+INLINE_COST = 200  # operations up to which a kernel is inlined into its loops
 CHUNK = 3000  # rows of a tape in one function: compile time grows faster than length
 
 
@@ -361,11 +387,23 @@ def _write(e: Emitter, tape: Tape, rows: Iterable[int], slots: dict[int, int]) -
                 values[i] = e.load("%work", slots[i])
         return values[i]
 
+    def joint_angles() -> list[int]:
+        angles = (tape.rows[i][1] for i in rows if tape.rows[i][0] in (SIN, COS))
+        return list(dict.fromkeys(a for a in angles if tape.rows[a][0] == INPUT))
+
+    def angle(i: int) -> str:
+        op, argument, index = tape.rows[i]
+        if op != INPUT or e.lanes > 1 or tape.cost <= INLINE_COST:
+            return value(i)
+        # volatile: neighbours loaded as one vector would wait for the stores of its parts to drain
+        return e.emit(f"load volatile double, ptr {e.element(f'%in{argument}', index)}, align 8")
+
     for i in rows:
         op, a, b = tape.rows[i]
         if op in (SIN, COS):
             if a not in pairs:
-                pairs[a] = e.sincos(value(a))
+                angles = joint_angles() if tape.rows[a][0] == INPUT else [a]
+                pairs.update(zip(angles, e.side_by_side([angle(k) for k in angles]), strict=True))
             values[i] = pairs[a][op == COS]
         elif op not in (CONST, INPUT):
             values[i] = _operation(e, op, value(a), None if b is None else value(b))

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from .cache import Cache
 from .jit import Loaded, compile_ir, load
-from .llvm import declarations, kernel
+from .llvm import INLINE_COST, declarations, kernel
 from .loops import declare, map_function
 from .tape import Tape
 
 Array = NDArray[np.float64]
-
-INLINE_COST = 200  # operations up to which a kernel is inlined into its loops
 
 
 @dataclass(frozen=True)

@@ -58,15 +58,25 @@ class Shape:
 
 
 def combine(e: Emitter, out: str, x: str, h: str, terms: list[tuple[float, str]], size: int) -> None:
-    """out = x + h sum_j weight_j k_j, over `size` scalars."""
+    """out = x + h sum_j weight_j k_j, over `size` scalars; the newest k comes last, one operation before the
+    result, since everything waits for it.
+    """
+    scaled = [(e.f("fmul", h, e.const(weight)), k) for weight, k in terms]
+    for i in e.over(size):
+        total = e.load(x, i)
+        for weight, k in scaled:
+            total = e.f("fadd", total, e.f("fmul", weight, e.load(k, i)))
+        e.store(total, out, i)
+
+
+def advance(e: Emitter, out: str, x: str, h: str, terms: list[tuple[float, str]], size: int) -> None:
+    """What `combine` does, rounded to x's precision only once: for the state that steps hand on."""
     for i in e.over(size):
         total = ""
         for weight, k in terms:
-            value = e.load(k, i)
-            part = e.f("fmul", value, e.const(weight))
+            part = e.f("fmul", e.load(k, i), e.const(weight))
             total = part if not total else e.f("fadd", total, part)
-        start = e.load(x, i)
-        e.store(e.f("fadd", start, e.f("fmul", total, h)) if total else start, out, i)
+        e.store(e.f("fadd", e.load(x, i), e.f("fmul", total, h)), out, i)
 
 
 def normalize(e: Emitter, x: str, quaternions: tuple[int, ...]) -> None:
@@ -179,7 +189,7 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
                         offset = e.emit(f"mul nsw i64 {number}, %w_row")
                         block.gather(shifted(e, w_rows, offset), W, shape.nw)
                     e.do(f"call void @rate({shape.split(e, at)}, ptr {U}, ptr {W}, ptr {P}, ptr {K[i]})")
-                combine(e, X, X, h, [(float(method.b[i]), K[i]) for i in used if method.b[i]], shape.nx)
+                advance(e, X, X, h, [(float(method.b[i]), K[i]) for i in used if method.b[i]], shape.nx)
                 normalize(e, X, shape.quaternions)
                 e.put(row, e.emit(f"add nsw i64 {e.get(row)}, {stages}"))
                 e.put(left, e.emit(f"sub nsw i64 {e.get(left)}, 1"))
