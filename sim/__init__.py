@@ -6,7 +6,7 @@
 (251, 1)
 """
 
-from .errors import EngineError, FilmError, ModelError, PantographError, RecordingError, SceneError
+from .errors import EngineError, FilmError, ModelError, PantographError, RecordingError, RunError, SceneError
 from .plan import Plan, make_plan
 from .plots import plot
 from .recording import ErrorEstimate, Recording, load
@@ -24,6 +24,7 @@ __all__ = [
     "Plan",
     "Recording",
     "RecordingError",
+    "RunError",
     "Scene",
     "SceneError",
     "load",

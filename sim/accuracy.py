@@ -8,18 +8,16 @@ import mujoco
 import numpy as np
 
 from .control import Replay
-from .engines.interface import Array, Engine, Event, Problem, Segment
+from .engines.interface import Array, Engine, Problem, Segment
 from .kinds import BALL, FREE, HINGE
 from .recording import ErrorEstimate
 
 
-def estimate_error(
-    engine: Engine, problem: Problem, segment: Segment, events: tuple[Event, ...], period: float | None
-) -> ErrorEstimate:
+def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: float | None) -> ErrorEstimate:
     """Error of ``segment`` by extrapolation: |x_h - x_h/2| 2^p / (2^p - 1) (Hairer, Norsett, Wanner,
     Solving Ordinary Differential Equations I, II.4), with the same control samples at half the step.
 
-    Contacts and limits break the order p: from the first event on, p = 1 is assumed, and
+    Contacts and limits break the order p: from the first event of either run on, p = 1 is assumed, and
     ``trusted_until`` says when that begins. Infinite where the run at half the step has diverged.
     Raises KeyboardInterrupt when it was interrupted.
     """
@@ -35,6 +33,7 @@ def estimate_error(
     angle, length = np.full((2, len(segment.t)), np.inf)
     angle[:n], length[:n] = difference(problem.model, segment.q[:n], finer.q[:n])
     order = engine.order(problem.integrator)
+    events = (*segment.events, *finer.events)
     first = min((e.t for e in events if e.kind in ("contact", "limit")), default=np.inf)
     p = np.where(segment.t < first, order, 1)
     factor = 2.0**p / (2.0**p - 1.0)

@@ -9,8 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models import name_of
 from .clip import Clip
 from .engines.interface import Array, Drive, Held, Problem, Role
+from .errors import EngineError
 from .kinds import SCALAR
 
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -56,10 +58,16 @@ class Sampled:
         self.targets = self.clip.evaluate(ticks)
 
     def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
-        """See :class:`~pantograph.sim.engines.interface.Controls`."""
+        """See :class:`~pantograph.sim.engines.interface.Controls`.
+
+        Raises EngineError for forces that are not finite; MuJoCo would take them for zero.
+        """
         target = Target(self.targets.q[k], self.targets.v[k], self.targets.a[k])
         tau, self.memory = self.law(t, q, v, target, self.memory)
         qfrc = np.where(self.tracked, tau, 0.0)
+        if not np.isfinite(qfrc).all():
+            joint = name_of(self.clip.model, "joint", int(self.clip.model.dof_jntid[~np.isfinite(qfrc)][0]))
+            raise EngineError(f"the controller gives no finite force for joint {joint!r}")
         ctrl = np.zeros(self.nu)
         ctrl[self.actuators.index] = self.actuators.ctrl_for(qfrc, q, v)
         qfrc[self.actuators.dof] = 0.0

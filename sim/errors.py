@@ -1,6 +1,13 @@
 """Errors of the simulation side; one family with those of the models."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from ..models.errors import ModelError, PantographError, unknown
+
+if TYPE_CHECKING:
+    from .recording import Recording
 
 __all__ = [
     "EngineError",
@@ -10,6 +17,7 @@ __all__ = [
     "ModelError",
     "PantographError",
     "RecordingError",
+    "RunError",
     "SceneError",
     "unknown",
 ]
@@ -25,6 +33,14 @@ class KeyingError(PantographError):
 
 class EngineError(PantographError):
     """An engine cannot do what the problem asks, or the run left the domain where it makes sense."""
+
+
+class RunError(EngineError):
+    """A run ended by an error in the middle, its cause; ``recording`` has what was computed until then."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording.message)
+        self.recording = recording
 
 
 class RecordingError(PantographError):

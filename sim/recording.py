@@ -67,7 +67,7 @@ class Recording:
     forces [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,) sum of contact normal forces
     [N]; keyed, tracked (nv,) masks; tick_t (m,), tick_ctrl (m, nu), tick_qfrc (m, nv): the controller's
     samples, held in between; missed (n, goals, 2): distance [m] and angle [rad] from each of ``goals``.
-    ``status`` is 'done', 'diverged' or 'interrupted'. Arrays are read-only.
+    ``status`` is 'done', 'diverged', 'interrupted' or 'failed'. Arrays are read-only.
     """
 
     t: Array

@@ -14,8 +14,10 @@ from .accuracy import estimate_error
 from .checks import check_frames
 from .compose import make_engine, make_law
 from .control import Sampled
+from .engines.common import Broken
 from .engines.derive import derive
-from .engines.interface import Array, Controls, Role, Segment
+from .engines.interface import Array, Controls, Engine, Role, Segment
+from .errors import EngineError, RunError
 from .plan import Plan, make_plan
 from .recording import Recording, model_to_bytes
 from .scene.build import Setup
@@ -35,15 +37,29 @@ def run(
 
     ``error`` adds an estimate of the discretisation error, billed apart. ``progress`` is told the
     simulated time [s]. A run that diverges or is interrupted returns what it has, with a status and message.
-    Raises SceneError for a scene with mistakes and EngineError for what the engine cannot do.
+    Raises SceneError for a scene with mistakes, EngineError for what the engine cannot do, and RunError, with
+    what it has, when the controller or the engine fails on the way.
     """
     if isinstance(scene, str | Path):
         scene = load_scene(scene)
     plan = scene if isinstance(scene, Plan) else make_plan(scene)
-    problem, setup = plan.problem, plan.setup
+    problem = plan.problem
     engine = make_engine(plan.engine.what)
     controls = _controls(plan)
-    segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
+    failure: BaseException | None = None
+    try:
+        segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
+    except Broken as broken:
+        segment, failure = broken.segment, broken.__cause__
+    recording = _recorded(plan, segment, engine if error else None)
+    if failure is not None:
+        raise RunError(recording) from failure
+    return recording
+
+
+def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
+    """The recording of a segment, with an error estimate when the ``engine`` for it is given."""
+    problem, setup = plan.problem, plan.setup
     status, message, estimate, notes = segment.status, segment.message, None, [_UNCHECKED]
     missed: dict[str, Array] = {}
     try:
@@ -51,8 +67,10 @@ def run(
         notes = check_frames(setup, segment.t, segment.q)
         missed = _missed(setup, segment)
         notes += _sentences(missed, segment.t)
-        if error and status == "done" and segment.stats["steps"]:
-            estimate = estimate_error(engine, problem, segment, derived.events, plan.period)
+        if engine is not None and status == "done" and segment.stats["steps"]:
+            estimate = estimate_error(engine, problem, segment, plan.period)
+    except EngineError as e:
+        notes.append(f"no error estimate: {e}")
     except KeyboardInterrupt:
         # the motion is there: what belongs to it is worth the moment that it takes
         derived = derive(problem, segment)
@@ -73,7 +91,7 @@ def run(
         tick_t=segment.tick_t,
         tick_ctrl=segment.tick_ctrl,
         tick_qfrc=segment.tick_qfrc,
-        events=derived.events,
+        events=segment.events,
         status=status,
         message=message,
         stats=segment.stats,

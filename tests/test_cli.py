@@ -8,6 +8,7 @@ import time
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pantograph.sim import Scene, load, load_scene, make_plan, run
 from pantograph.sim.cli.app import run_app
@@ -126,7 +127,7 @@ def test_a_diverged_run_has_exit_code_1_and_is_saved(pantograph, folder):
     assert (folder / "out" / "p.png").is_file()
 
 
-def test_a_run_interrupted_at_once_is_saved_and_not_drawn(pantograph, folder, monkeypatch):
+def test_a_run_interrupted_at_once_is_saved_and_drawn_as_far_as_it_went(pantograph, folder, monkeypatch):
     module = sys.modules[run.__module__]
 
     def stop(_):
@@ -137,8 +138,32 @@ def test_a_run_interrupted_at_once_is_saved_and_not_drawn(pantograph, folder, mo
     code, _, err = pantograph("run", "swing.toml", "--plot", "p.png")
     assert code == 130
     assert err.startswith("interrupted: interrupted at t = ")
-    assert load(folder / "out" / "swing.npz").status == "interrupted"
-    assert not (folder / "out" / "p.png").exists()
+    kept = load(folder / "out" / "swing.npz")
+    assert kept.status == "interrupted"
+    assert 0 < kept.t[-1] < 0.3
+    assert (folder / "out" / "p.png").is_file()
+
+
+def test_a_run_whose_controller_fails_is_saved_and_told(pantograph, folder, monkeypatch):
+    from pantograph.controllers.pd import PD
+
+    def law(self, t, q, v, target, memory):
+        return (np.zeros(len(v)), memory) if t < 0.1 else 1 / 0
+
+    monkeypatch.setattr(PD, "__call__", law)
+    keys = (
+        '[roles]\ntracked = ["hinge"]\n[[keys]]\njoint = "hinge"\ntimes = [0]\nvalues = [0]\n[controller]\n'
+    )
+    (folder / "broken.toml").write_text(SWING + keys + '[solver]\nengine = "contact"\n')
+    code, out, err = pantograph("run", "broken.toml", "--error")
+    assert code == 1
+    assert re.match(
+        r"failed: failed at t = 0\.1 s: ZeroDivisionError: division by zero \(.*test_cli\.py, line", err
+    )
+    assert "Traceback" not in err
+    kept = load(folder / "out" / "broken.npz")
+    assert (kept.status, kept.t[-1]) == ("failed", pytest.approx(0.1))
+    assert "0.1 s in" in out
 
 
 def test_notes_of_what_was_crossed_are_printed(pantograph, folder):

@@ -1,3 +1,5 @@
+import dataclasses
+
 import matplotlib
 import matplotlib._pylab_helpers
 import numpy as np
@@ -118,11 +120,7 @@ def test_what_cannot_be_plotted_is_said(recording, tmp_path):
     with pytest.raises(PantographError, match="cannot write the plot"):
         plot(recording, tmp_path / "file" / "p.png")
 
-    def stop(t):
-        raise KeyboardInterrupt
-
-    short = run(Scene(**ARM), progress=stop)
-    assert len(short.t) < 2
+    short = dataclasses.replace(recording, t=recording.t[:1])
     with pytest.raises(PantographError, match="fewer than two samples"):
         plot(short, tmp_path / "p.png")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pantograph.sim import Scene, load, make_plan, run
+from pantograph.sim import EngineError, RunError, Scene, load, make_plan, run
 from scenes import numbers, scenes
 
 FALL = {"duration": 2.0, "models": [{"file": "double_pendulum"}], "initial": {"position": {"shoulder": 2.0}}}
@@ -63,14 +63,98 @@ def test_an_interrupted_run_keeps_the_beginning_of_the_whole_one(tmp_path_factor
         return
     assert r.status == "interrupted"
     assert "interrupted at t = " in r.message
-    n = len(r.t)
+    n = len(r.t) - (r.t[-1] not in whole.t)
     assert 0 < n < len(whole.t)
     for name in SAMPLED:
-        np.testing.assert_array_equal(getattr(r, name), getattr(whole, name)[:n])
+        np.testing.assert_array_equal(getattr(r, name)[:n], getattr(whole, name)[:n])
     np.testing.assert_array_equal(r.tick_qfrc, whole.tick_qfrc[: len(r.tick_t)])
     again = load(r.save(tmp_path_factory.getbasetemp() / "interrupted.npz"))
     np.testing.assert_array_equal(again.q, r.q)
     assert again.status == "interrupted"
+
+
+class Stop(Exception):
+    """Something that goes wrong."""
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, Stop])
+@pytest.mark.parametrize("integrator", ["rk4", "euler"])
+@pytest.mark.parametrize("data", [{**FALL, "duration": 0.5}, {**TRACKED, "duration": 0.5}])
+@given(calls=st.integers(1, 120), late=st.booleans())
+@settings(max_examples=6)
+def test_a_run_stopped_within_a_step_keeps_the_last_whole_one(data, integrator, stop, calls, late):
+    """Ctrl-C or an error at any evaluation of the equations of motion, before or after it, of any stage."""
+    from pantograph.sim.engines import contact
+
+    step = make_plan(Scene(**data)).problem.step
+    scene = {**data, "solver": {"engine": "contact", "integrator": integrator, "step": step}}
+    dense = run(Scene(**scene, rate=1 / step))
+    left = calls
+
+    def failing(real):
+        def call(*args):
+            nonlocal left
+            left -= 1
+            if left == 0 and not late:
+                raise stop
+            out = real(*args)
+            if left == 0:
+                raise stop
+            return out
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contact.mujoco, "mj_step", failing(mujoco.mj_step))
+        patch.setattr(contact.Prescriber, "forward", failing(contact.Prescriber.forward))
+        try:
+            r = run(Scene(**scene, rate=25))
+        except RunError as e:
+            assert isinstance(e.__cause__, Stop)
+            r = e.recording
+    assert r.status == ("interrupted" if stop is KeyboardInterrupt else "failed")
+    assert f"{r.status} at t = {r.t[-1]:.4g} s" in r.message
+    at = np.searchsorted(dense.t, r.t - 1e-9)
+    for name in ("t", "q", "v"):
+        np.testing.assert_array_equal(getattr(r, name), getattr(dense, name)[at])
+    if "keys" not in data:  # one evaluation to settle, then one call a step
+        assert at[-1] == max(0, calls - 2 + late)
+    else:  # at most four to settle
+        each = 4 if integrator == "rk4" else 1
+        assert (calls - 4) // each - 1 <= at[-1] <= calls // each
+
+
+def test_a_controller_that_fails_or_gives_no_number_is_named_and_the_run_kept(monkeypatch):
+    from pantograph.controllers.pd import PD
+
+    real, whole = PD.__call__, run(Scene(**TRACKED, controller={"law": "pd"}, solver={"engine": "contact"}))
+
+    def nothing(self, t, q, v, target, memory):
+        tau, memory = real(self, t, q, v, target, memory)
+        return (tau if t < 0.5 else tau * np.nan), memory
+
+    monkeypatch.setattr(PD, "__call__", nothing)
+    with pytest.raises(
+        RunError, match=r"failed at t = 0.5 s: .* no finite force for joint 'elbow'"
+    ) as caught:
+        run(Scene(**TRACKED, controller={"law": "pd"}, solver={"engine": "contact"}), error=True)
+    kept = caught.value.recording
+    assert kept.status == "failed"
+    assert kept.error is None
+    assert kept.t[-1] == pytest.approx(0.5)
+    n = len(kept.t) - 1
+    np.testing.assert_array_equal(kept.q[:n], whole.q[:n])
+    assert np.isfinite(kept.tau).all()
+
+
+def test_an_estimate_that_fails_leaves_the_run_and_a_note(monkeypatch):
+    def fails(*args):
+        raise EngineError("too many impacts")
+
+    monkeypatch.setattr(sys.modules[run.__module__], "estimate_error", fails)
+    r = run(Scene(**FALL), error=True)
+    assert (r.status, r.error) == ("done", None)
+    assert "no error estimate: too many impacts" in r.notes
 
 
 @pytest.mark.parametrize("after", [0.05, 0.2, 0.35])

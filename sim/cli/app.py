@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from ..errors import PantographError
+from ..errors import PantographError, RunError
 from . import show
 from .template import TEMPLATE
 
@@ -91,7 +91,10 @@ def run(
         _mirror(plan, mirror, rig_motion, options | {"live": True})
         return
     with show.progress(f"simulating {scene.stem}", plan.problem.duration) as advance:
-        recording = run_scene(plan, error=error, progress=advance)
+        try:
+            recording = run_scene(plan, error=error, progress=advance)
+        except RunError as e:
+            recording = e.recording
     saved = recording.save(out / f"{scene.stem}.npz")
     console.print(show.summary(recording))
     show.notes(console, recording)

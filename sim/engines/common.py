@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import traceback
 from typing import TypedDict
 
 import mujoco
 import numpy as np
 
 from ...models import name_of
-from ..errors import EngineError
-from .interface import Array, Controls, Held, State
+from ..errors import EngineError, PantographError
+from .interface import Array, Controls, Held, Segment, State
 
 HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) for a state that makes sense
+
+
+class Broken(EngineError):
+    """An error in the middle of a run; ``segment`` is what was computed until then."""
+
+    def __init__(self, segment: Segment) -> None:
+        super().__init__(segment.message)
+        self.segment = segment
+
+
+def place_of(error: Exception) -> str:
+    """What an error says; for one that is not ours, also its kind and where it was raised."""
+    if isinstance(error, PantographError):
+        return str(error)
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({frame.filename}, line {frame.lineno}, in {frame.name})"
 
 
 def steps_per_tick(controls: Controls | None, step: float) -> int:

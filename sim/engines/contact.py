@@ -12,11 +12,12 @@ import numpy as np
 from ...models import captured_warnings
 from ..errors import EngineError
 from ..kinds import BALL, FREE
-from .common import fastest_joint, joint_of_largest, recorded, steps_per_tick
+from .common import Broken, fastest_joint, joint_of_largest, place_of, recorded, steps_per_tick
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
 from .timed import Timed, TimedInputs
+from .touch import Touch
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -79,28 +80,51 @@ class _Run:
         self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
         self.quat = _quaternion_joints(self.model)
         self.evaluations = 0
+        self.touch = Touch(self.model)
+        self.k = 0  # the step to come
+        self.torn: tuple[int, State] | None = None  # a step that has begun, and the state before it
         self.samples: list[tuple[float, State]] = []
         self.ticks: list[tuple[float, Held]] = []
 
     def segment(self, progress: Callable[[float], None] | None) -> Segment:
-        started, status, message, k = time.perf_counter(), "done", "", 0
-        self._start()
+        started, status, message, failure = time.perf_counter(), "done", "", None
         try:
+            self._start()
             while True:
-                if message := self._nonsense(k):
+                if message := self._nonsense(self.k):
                     status = "diverged"
                     break
-                self._stop_at(k)
-                if k >= self.steps:
+                self._stop_at(self.k)
+                if self.k >= self.steps:
                     break
-                n = self._until_next(k)
-                self._advance(k, n)
-                k += n
+                self._advance(self._until_next(self.k))
                 if progress:
-                    progress(self.t0 + k * self.h)
+                    progress(self.t0 + self.k * self.h)
         except KeyboardInterrupt:
-            status, message = "interrupted", f"interrupted at t = {self.t0 + k * self.h:.4g} s"
-        return self._result(status, message, k, time.perf_counter() - started)
+            status, message = "interrupted", f"interrupted at t = {self._keep_last():.4g} s"
+        except Exception as error:
+            status, message, failure = (
+                "failed",
+                f"failed at t = {self._keep_last():.4g} s: {place_of(error)}",
+                error,
+            )
+        segment = self._result(status, message, self.k, time.perf_counter() - started)
+        if failure is not None:
+            raise Broken(segment) from failure
+        return segment
+
+    def _keep_last(self) -> float:
+        """Record the state after the last whole step of a run that was stopped; its time [s]."""
+        d = self.data
+        now = State(d.qpos.copy(), d.qvel.copy(), d.act.copy())
+        self.k, last = self.torn or (round((d.time - self.t0) / self.h), now)
+        t = self.t0 + self.k * self.h
+        if (
+            not (self.samples and self.samples[-1][0] >= t)
+            and fastest_joint(self.model, last.q, last.v) is None
+        ):
+            self.samples.append((t, last))
+        return t
 
     def _start(self) -> None:
         d, s = self.data, self.problem.state0
@@ -127,19 +151,25 @@ class _Run:
             self.held = self.controls.sample(k // self.per_tick, t, d.qpos.copy(), d.qvel.copy())
             self.ticks.append((t, self.held))
 
-    def _advance(self, k: int, n: int) -> None:
+    def _advance(self, n: int) -> None:
+        step = self._plain
+        if not self.timed.empty:
+            step = self._runge_kutta if self.problem.integrator == "rk4" else self._native
         self.data.ctrl[:] = self.held.ctrl
-        if self.timed.empty:
-            self.data.qfrc_applied[:] = self.held.qfrc
-            self.data.time = self.t0 + k * self.h
-            mujoco.mj_step(self.model, self.data, n)
-            self.evaluations += n * (4 if self.problem.integrator == "rk4" else 1)
-            return
-        advance = self._runge_kutta if self.problem.integrator == "rk4" else self._native
-        for step in range(k, k + n):
-            if step in self.jumps:
-                self._jump(step)
-            advance(step)
+        for k in range(self.k, self.k + n):
+            if k in self.jumps:
+                self._jump(k)
+            step(k)
+            self.k = k + 1
+            self.touch.look(self.data, self.t0 + k * self.h)
+
+    def _plain(self, k: int) -> None:
+        """A step without prescribed inputs; the integrator is MuJoCo's own."""
+        d = self.data
+        d.qfrc_applied[:] = self.held.qfrc
+        d.time = self.t0 + k * self.h
+        mujoco.mj_step(self.model, d)
+        self.evaluations += 4 if self.problem.integrator == "rk4" else 1
 
     def _jump(self, k: int) -> None:
         """Velocities that keyed joints take up at once pull the others along: M_pp dv_p = -M_pk dv_k."""
@@ -172,6 +202,7 @@ class _Run:
         h, d = self.h, self.data
         (begin, middle, end), row = self._inputs(k)
         q0, v0, act0 = d.qpos.copy(), d.qvel.copy(), d.act.copy()
+        self.torn = k, State(q0, v0, act0)
         rates: list[tuple[Array, Array, Array]] = []
         for inputs, c in zip((begin, middle, middle, end), (0.0, 0.5, 0.5, 1.0), strict=True):
             if rates:
@@ -194,6 +225,7 @@ class _Run:
         """MuJoCo's one-stage integrators; keyed joints get the mean acceleration over the step."""
         h, d, p = self.h, self.data, self.prescriber
         (begin, _, end), row = self._inputs(k)
+        self.torn = k, State(d.qpos.copy(), d.qvel.copy(), d.act.copy())
         self._prescribe_state(begin, row)
         self._apply(begin, row)
         d.qfrc_applied[:] = self.held.qfrc
@@ -214,6 +246,7 @@ class _Run:
             self._prescribe_state(begin, row)
         else:
             self._prescribe_state(self.timed.at(np.array([self.data.time])), 0)
+        self.torn = None
 
     def _prescribe_state(self, inputs: TimedInputs, row: int) -> None:
         self.data.qpos[self.timed.qpos] = inputs.q[row]
@@ -275,7 +308,11 @@ class _Run:
             "wall_s": wall,
         }
         return Segment(
-            **recorded(self.model, self.samples, self.ticks), status=status, message=message, stats=stats
+            **recorded(self.model, self.samples, self.ticks),
+            status=status,
+            message=message,
+            stats=stats,
+            events=tuple(self.touch.events),
         )
 
 

@@ -1,4 +1,4 @@
-"""What follows from recorded states: accelerations, drive forces, energies, contacts and limits."""
+"""What follows from recorded states: accelerations, drive forces, energies, normal forces."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from ...models import captured_warnings, name_of
-from .interface import Array, Event, Problem, Role, Segment
+from ...models import captured_warnings
+from .interface import Array, Problem, Role, Segment
 from .prescribe import Prescriber
 from .timed import Timed
 
@@ -19,7 +19,7 @@ class Derived:
 
     a (n, nv); tau (n, nv): force of actuators, controllers and, on keyed joints, the force that a drive
     needs for the keyed motion [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,): sum of
-    contact normal forces [N]; events.
+    contact normal forces [N].
     """
 
     a: Array
@@ -28,7 +28,6 @@ class Derived:
     kinetic: Array
     potential: Array
     normal: Array
-    events: tuple[Event, ...]
 
 
 def derive(problem: Problem, segment: Segment) -> Derived:
@@ -46,8 +45,6 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
     inputs = timed.at(segment.t)
     a, tau, ctrl = np.zeros((n, m.nv)), np.zeros((n, m.nv)), np.zeros((n, m.nu))
     kinetic, potential, normal = np.zeros(n), np.zeros(n), np.zeros(n)
-    events: list[Event] = []
-    touching: set[tuple[str, str]] = set()
     tick = np.searchsorted(segment.tick_t, segment.t + 1e-9, side="right") - 1
     for i in range(n):
         d.qpos[:], d.qvel[:], d.act[:], d.time = segment.q[i], segment.v[i], segment.act[i], segment.t[i]
@@ -66,11 +63,9 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
             p.settle(d, qfrc, inputs.a[i])
             a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
             tau[i, p.keyed] = p.drive + friction * np.sign(segment.v[i, p.keyed])
-            now, normal[i] = _active(p.model, d)
-            events += _changes(segment.t[i], touching, now)
-            touching = now
+            normal[i] = _normal(p.model, d)
         kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
-    return Derived(a, tau, ctrl, kinetic, potential, normal, (*events, *segment.events))
+    return Derived(a, tau, ctrl, kinetic, potential, normal)
 
 
 def dry_friction(model: mujoco.MjModel) -> Array:
@@ -101,28 +96,11 @@ def _energy(model: mujoco.MjModel, data: mujoco.MjData, q: Array, v: Array) -> t
     return float(data.energy[1]), float(data.energy[0])
 
 
-def _active(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[set[tuple[str, str]], float]:
-    """Touching pairs of bodies and joints at a limit, as (kind, what); and the sum of normal forces."""
-    now: set[tuple[str, str]] = set()
+def _normal(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Sum of the normal forces [N] of all contacts."""
     total, force = 0.0, np.zeros(6)
     for c in range(data.ncon):
-        contact = data.contact[c]
-        if contact.efc_address < 0:
-            continue
-        mujoco.mj_contactForce(model, data, c, force)
-        if force[0] <= 0:
-            continue
-        total += float(force[0])
-        names = sorted(name_of(model, "body", int(model.geom_bodyid[g])) for g in contact.geom)
-        now.add(("contact", " - ".join(names)))
-    limits = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
-    for row in limits:
-        if data.efc_force[row] > 0:
-            now.add(("limit", name_of(model, "joint", int(data.efc_id[row]))))
-    return now, total
-
-
-def _changes(t: float, before: set[tuple[str, str]], now: set[tuple[str, str]]) -> list[Event]:
-    begun = [Event(float(t), kind, what) for kind, what in sorted(now - before)]
-    ended = [Event(float(t), f"{kind} end", what) for kind, what in sorted(before - now)]
-    return begun + ended
+        if data.contact[c].efc_address >= 0:
+            mujoco.mj_contactForce(model, data, c, force)
+            total += float(force[0])
+    return total
