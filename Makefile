@@ -7,6 +7,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SCENE ?= models/scenes/waving_arm.toml
 PROCESSES ?= 2
+# setuptools warns of every editable install that a folder of the package's name would hide it
+PIP = PYTHONWARNINGS="ignore:Editable installation" $(BIN)/python -m pip install --quiet
 
 .PHONY: demo test lint bench system
 .DEFAULT_GOAL := demo
@@ -18,12 +20,12 @@ $(BIN)/python:
 	@sh .ci/make-venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml .ci/constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/python -m pip install --quiet --constraint .ci/constraints.txt --editable .
+	$(PIP) --upgrade "pip>=25.1"
+	$(PIP) --constraint .ci/constraints.txt --editable .
 	@touch $@
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint .ci/constraints.txt --editable ".[torch]" --group test
+	$(PIP) --constraint .ci/constraints.txt --editable ".[torch]" --group test
 	@mkdir -p .types && ln -sfn .. .types/pantograph
 	@touch $@
 

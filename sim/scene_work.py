@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -75,7 +76,8 @@ def scene_case(plan: Plan) -> Case:
         every = max(1, round(duration / FRAMES / plan.period))
         frames = max(1, int(duration / (every * plan.period) + 1e-9))
         duration = frames * every * plan.period
-    name = plan.setup.scene.title or "scene"
+    scene = plan.setup.scene
+    name = scene.title or Path(scene._file).stem
     return Case(name, problem.model, problem.state0.q, problem.state0.v, duration, frames=frames)
 
 

@@ -16,6 +16,7 @@ from pantograph.sim.errors import FilmError
 from pantograph.sim.film import Camera, Light, Renderer, default_lights, film, resampled, still, write
 from pantograph.sim.film.cameras import look_at
 from pantograph.sim.film.context import Context
+from pantograph.sim.film.drawing import batches
 from pantograph.sim.film.shapes import Shape, coarse, crease_normals, geom_shape
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -201,6 +202,18 @@ def test_collision_groups_and_invisible_geoms_are_left_out_and_a_model_of_only_t
             shown.append(np.isfinite(renderer.depth(model.qpos0, camera=camera)).sum())
     assert shown[0] > 100
     assert shown[0] == shown[1] == shown[2]
+
+
+def test_a_sky_is_missed_only_when_it_is_a_picture(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "sky.png")
+    geom = '<worldbody><geom size=".1"/></worldbody>'
+    notes = []
+    for sky in (f'file="{tmp_path / "sky.png"}"', 'builtin="gradient" rgb1="1 1 1" width="8" height="8"'):
+        asset = f'<asset><texture name="sky" type="skybox" {sky}/></asset>'
+        model = mujoco.MjModel.from_xml_string(f"<mujoco>{asset}{geom}</mujoco>")
+        notes.append(batches(model, plane_radius=1.0)[1])
+    assert notes == [("the picture of the skybox gives way to the film's background",), ()]
 
 
 @needs_gl

@@ -215,3 +215,12 @@ def test_report_on_a_scene_with_a_controller(tmp_path):
 def test_unknown_engines_are_named():
     with pytest.raises(EngineError, match="did you mean 'mujoco'"):
         report(swing(), engines=("mujoko",))
+
+
+@pytest.mark.parametrize(("title", "name"), [('title = "A swing"\n', "A swing"), ("", "plain")])
+def test_a_report_bears_the_name_of_its_scene(tmp_path, title, name):
+    path = tmp_path / "plain.toml"
+    path.write_text(f'{title}duration = 0.1\n[[models]]\nfile = "pendulum"\n[initial.position]\nhinge = 1\n')
+    found = report(path, budget_s=1e-4)
+    assert found.name == name
+    assert found.figure().get_suptitle() == name

@@ -102,8 +102,10 @@ def _left_out(model: mujoco.MjModel) -> Iterator[str]:
     for count, what in ((model.nskin, "skins"), (model.nflex, "flexes")):
         if count:
             yield f"{what} are not drawn"
-    if (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
-        yield "the skybox texture gives way to the film's background"
+    # a plain sky is as good as the film's own; a picture of one is somebody's intention
+    pictured = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX) & (model.tex_pathadr >= 0)
+    if pictured.any():
+        yield "the picture of the skybox gives way to the film's background"
 
 
 def _rgba(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
