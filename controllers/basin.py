@@ -57,37 +57,28 @@ class Catch:
         self.regulator: Regulator = dlqr(A[0], B[0], np.diag(1.0 / scale**2), np.eye(int(self.tracked.sum())))
 
     def state(self, q: Array, v: Array) -> Array:
-        """Deviation (..., 2 nv) from the goal, angles in [-pi, pi)."""
+        """Deviation (..., 2 nv) from the goal, angles in [-pi, pi]."""
         d = q - self.goal
-        d = np.where(self.hinge, np.mod(d + np.pi, 2.0 * np.pi) - np.pi, d)
+        turns = np.rint(d[..., self.hinge] / (2.0 * np.pi))
+        d[..., self.hinge] -= 2.0 * np.pi * turns
         return np.concatenate([d, v], axis=-1)
 
-    def value(self, q: Array, v: Array) -> Array:
-        """x'P x (...,): the cost to come if nothing saturated."""
-        x = self.state(q, v)
-        return np.asarray(np.einsum("...i,ij,...j->...", x, self.regulator.P, x))
+    def value(self, x: Array) -> Array:
+        """x'P x (...,) of deviations x (..., 2 nv): the cost to come if nothing saturated."""
+        return np.asarray(np.einsum("...i,...i->...", x @ self.regulator.P, x))
 
-    def force(self, q: Array, v: Array) -> Array:
-        """Joint forces (..., nv), not yet cut."""
-        tau = np.zeros_like(v)
-        tau[..., self.tracked] = -self.state(q, v) @ self.regulator.K.T
+    def force(self, x: Array) -> Array:
+        """Joint forces (..., nv) at deviations x (..., 2 nv), not yet cut."""
+        tau = np.zeros((*x.shape[:-1], len(self.tracked)))
+        tau[..., self.tracked] = -x @ self.regulator.K.T
         return np.asarray(np.where(self.tracked, tau + self.hold, 0.0))
 
 
 def advance(nominal: Nominal, q: Array, v: Array, tau: Array, step: float, steps: int) -> tuple[Array, Array]:
-    """A batch of states q, v (b, n) after ``steps`` RK4 steps under held joint forces, scalar joints."""
-    f = nominal.smooth.forward
-    for _ in range(steps):
-        a1 = f(q, v, tau=tau)
-        v2 = v + 0.5 * step * a1
-        a2 = f(q + 0.5 * step * v, v2, tau=tau)
-        v3 = v + 0.5 * step * a2
-        a3 = f(q + 0.5 * step * v2, v3, tau=tau)
-        v4 = v + step * a3
-        a4 = f(q + step * v3, v4, tau=tau)
-        q = q + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-        v = v + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-    return q, v
+    """A batch of states q, v (b, n) after ``steps`` RK4 steps under held joint forces (b, n)."""
+    u = np.concatenate([np.zeros((len(q), nominal.model.nu)), tau], axis=1)
+    path = nominal.pushed.rollout(q, v, u[:, None], step=step, steps=steps, hold=steps, every=steps)
+    return path.q[:, -1], path.v[:, -1]
 
 
 def comes_home(
@@ -97,15 +88,15 @@ def comes_home(
     ``limits``, least and greatest (nv,)."""
     low, high = limits
     ok = np.ones(len(q), dtype=bool)
-    begin = catch.value(q, v)
+    begin = catch.value(catch.state(q, v))
     for _ in range(int(seconds / catch.period)):
-        tau = np.clip(catch.force(q, v), low, high)
+        tau = np.clip(catch.force(catch.state(q, v)), low, high)
         q, v = advance(catch.nominal, q, v, tau, catch.period / steps, steps)
         with np.errstate(invalid="ignore"):
             lost = ~np.isfinite(q).all(axis=1) | (np.abs(v).max(axis=1) > 1e3)
         q, v = np.where(lost[:, None], catch.goal, q), np.where(lost[:, None], 0.0, v)
         ok &= ~lost
-    return np.asarray(ok & (catch.value(q, v) <= np.maximum(1e-3 * begin, 1e-9)))
+    return np.asarray(ok & (catch.value(catch.state(q, v)) <= np.maximum(1e-3 * begin, 1e-9)))
 
 
 @dataclass(frozen=True, eq=False)

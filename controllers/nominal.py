@@ -39,6 +39,11 @@ class Nominal:
         """The compiled model. Raises EngineError naming what the smooth engine cannot do."""
         return compile_model(self.model)
 
+    @cached_property
+    def pushed(self) -> Smooth:
+        """The compiled model whose controls end with joint forces (nv,), for whole rollouts."""
+        return compile_model(self.model, forces=True)
+
     def smooth_with(self, keyed: NDArray[np.bool_] | None) -> Smooth:
         """The compiled model in which the freedoms ``keyed`` (nv,) move as prescribed."""
         if keyed is None or not keyed.any():

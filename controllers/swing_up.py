@@ -30,25 +30,29 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PARTS = 16  # stretches of added force on the way to the goal
-_SAMPLES, _ROUNDS, _BRANCHES = 64, 5, 6  # of the cross-entropy method; gains it starts from
+_SAMPLES, _ROUNDS, _BRANCHES = 64, 5, 3  # of the cross-entropy method; gains it starts from
+_ARRIVED = 1e12  # that arrivals are better than any value
+_CATCHING = 2.0  # seconds that a corrected motion has after its nearest point to be caught
+_WELL_IN = 0.1  # of the catch's level: a machine that it has brought there is home
 
 
 class Intent(NamedTuple):
     """What a batch of machines (b,) is about to do: gains by their index; forces added to theirs in equal
-    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided [ticks]; when the
-    catch should have it, (b,) [ticks] from then (infinite: not foreseen)."""
+    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided (b,) [ticks]."""
 
     choice: NDArray[np.intp]
     extra: Array
     stretch: Array
     begun: Array
-    arrival: Array
 
-    def of(self, rows: NDArray[np.intp]) -> Intent:
+    def of(self, rows: NDArray[np.intp] | Mask) -> Intent:
         """Those of some machines, as arrays of their own."""
-        return Intent(
-            self.choice[rows], self.extra[rows], self.stretch[rows], self.begun[rows], self.arrival[rows]
-        )
+        return Intent(self.choice[rows], self.extra[rows], self.stretch[rows], self.begun[rows])
+
+    def put(self, rows: NDArray[np.intp] | Mask, other: Intent) -> None:
+        """Overwrite those of some machines."""
+        for mine, theirs in zip(self, other, strict=True):
+            mine[rows] = theirs
 
 
 class SwingMemory(NamedTuple):
@@ -78,9 +82,9 @@ class SwingUp:
         period: float,
         *,
         goal: Mapping[str, float] | None = None,
-        foresight: float = 12.0,
+        foresight: float = 8.0,
         tries: int = 128,
-        every: float = 2.0,
+        every: float = 1.0,
         room: float = 0.05,
         seed: int = 1,
     ) -> None:
@@ -186,31 +190,30 @@ class SwingUp:
 
     def force(
         self, q: Array, v: Array, intent: Intent, tick: Array | int, caught: Mask
-    ) -> tuple[Array, Mask]:
-        """Joint forces (b, nv) within the limits at a tick, and who is in the hands of the catch."""
+    ) -> tuple[Array, Mask, Array]:
+        """Joint forces (b, nv) within the limits at a tick, who is in the catch's hands, and its value."""
         catch, level = self.catch
-        value = catch.value(q, v)
+        x = catch.state(q, v)
+        value = catch.value(x)
         caught = value < np.where(caught, 9.0 * level, level)
-        pump = self._pump(q, v, self.gains[intent.choice])
+        pump = self._pump(q, v, x[:, self.a], self.gains[intent.choice])
         part = ((tick - intent.begun) // intent.stretch).astype(np.intp)
         planned = part < intent.extra.shape[1]
         rows = np.arange(len(q))
         pump[:, self.a] += np.where(planned, intent.extra[rows, np.where(planned, part, 0)], 0.0)
-        tau = np.where(caught[:, None], catch.force(q, v), pump)
-        return np.clip(tau, self.low, self.high), caught
+        tau = np.where(caught[:, None], catch.force(x), pump)
+        return np.clip(tau, self.low, self.high), caught, value
 
-    def _pump(self, q: Array, v: Array, gains: Array) -> Array:
-        """Energy shaping, (b, nv)."""
-        smooth, a, n = self.nominal.smooth, self.a, self.model.nv
+    def _pump(self, q: Array, v: Array, where: Array, gains: Array) -> Array:
+        """Energy shaping, (b, nv), with the driven joints ``where`` (b,) from their goals."""
+        smooth, a = self.nominal.smooth, self.a
         w, zeta, weight, pull = gains.T
         kinetic, potential = smooth.energy(q, v)
         missing = self.top - kinetic - potential
-        inertia = smooth.mass_matrix(q)
-        bias = smooth.inverse(q, v, np.zeros_like(v))
-        unit = np.zeros((len(q), n, 2))
-        unit[:, a, 0], unit[:, :, 1] = 1.0, -bias
-        c, b = np.moveaxis(np.linalg.solve(inertia, unit)[:, a], -1, 0)
-        where = self.catch[0].state(q, v)[:, a]
+        unit = np.zeros(self.model.nv)
+        unit[a] = 1.0
+        b = smooth.forward(q, v)[:, a]
+        c = smooth.forward(q, v, tau=unit)[:, a] - b
         scale = self._lift * weight / self._mobility
         spring = w**2 * where + 2.0 * zeta * w * v[:, a]
         # while energy is missing the denominator may vanish: the sign of the pump is what counts then
@@ -247,82 +250,90 @@ class SwingUp:
         return float(np.linalg.inv(self.nominal.mass_matrix(self.goal))[self.a, self.a])
 
     def foresee(
-        self, q: Array, v: Array, intent: Intent, tick: int, caught: Mask
+        self,
+        q: Array,
+        v: Array,
+        intent: Intent,
+        tick: int,
+        machine: NDArray[np.intp],
+        until: Array | float = np.inf,
     ) -> tuple[Array, Array, Array]:
-        """What comes of intentions, (b,) each: ticks until the catch has the machine for good (infinite: it
-        does not, or a limit is crossed), the least value on the way, and ticks until then."""
-        b, catch = len(q), self.catch[0]
-        since, least, when = np.full(b, np.inf), np.full(b, np.inf), np.zeros(b)
-        alive, stays = np.ones(b, dtype=bool), int(1.0 / self.period)
+        """What comes ``until`` (b,) ticks later of intentions (b,), several for each ``machine`` (b,): ticks
+        until the catch has brought it well into its basin (infinite: another of the machine's is quicker, a
+        limit is crossed, or it does not), the least value on the way, and ticks until then."""
+        b, (_, level) = len(q), self.catch
+        until = np.broadcast_to(until, b)
+        home, least, when = np.full(b, np.inf), np.full(b, np.inf), np.zeros(b)
+        rows, caught, inside = np.arange(b), np.zeros(b, dtype=bool), np.ones(b, dtype=bool)
+        done = np.zeros(int(machine.max(initial=0)) + 1, dtype=bool)
         for k in range(int(self.foresight / self.period)):
-            tau, caught = self.force(q, v, intent, tick + k, caught)
-            since = np.where(caught & alive, np.minimum(since, k), np.inf)
-            value = np.where(alive, catch.value(q, v), np.inf)
-            least, when = np.where(value < least, value, least), np.where(value < least, k, when)
+            tau, caught, value = self.force(q, v, intent, tick + k, caught)
+            near = inside & (value < least[rows])
+            least[rows[near]], when[rows[near]] = value[near], k
+            arrived = rows[inside & caught & (value < _WELL_IN * level)]
+            home[arrived], done[machine[arrived]] = k, True
             q, v = advance(self.nominal, q, v, tau, self.period / 2, 2)
-            alive &= self._inside(q) & np.isfinite(v).all(axis=1) & (np.abs(v).max(axis=1) < 1e3)
-            q, v = np.where(alive[:, None], q, self.goal), np.where(alive[:, None], v, 0.0)
-            if (~alive | (k - since > stays)).all():
-                break
-        return np.where(alive, since, np.inf), least, when
+            inside &= self._inside(q)
+            if k % 10 == 9 or len(arrived):
+                keep = inside & (np.abs(v) < 1e3).all(axis=1) & ~done[machine[rows]] & (k < until[rows])
+                if not keep.any():
+                    break
+                q, v, intent = q[keep], v[keep], intent.of(keep)
+                rows, caught, inside = rows[keep], caught[keep], inside[keep]
+        return home, least, when
 
-    def intend(self, q: Array, v: Array, tick: int) -> Intent:
-        """For each machine (b,) the gains that bring it home first in simulation. Where none does, forces are
-        added to the gains that come nearest until they do (cross-entropy method, R. Rubinstein 1999)."""
+    def intend(self, q: Array, v: Array, tick: int, before: Intent) -> Intent:
+        """For each machine (b,) what brings it home first in simulation: one of the gains, or what it was
+        about to do ``before``. Where nothing does, forces are added to the gains that come nearest until they
+        do (cross-entropy method, R. Rubinstein 1999)."""
         b, k = len(q), self.tries
         if self.foresight == 0.0:
             return self._plain(np.zeros(b, dtype=np.intp), tick)
-        every = self._plain(np.tile(np.arange(k), b), tick)
-        none = np.zeros(b * k, dtype=bool)
-        since, least, when = self.foresee(np.repeat(q, k, axis=0), np.repeat(v, k, axis=0), every, tick, none)
-        points = np.where(np.isfinite(since), since - 1e12, least).reshape(b, k)
-        order = np.argsort(points, axis=1)[:, :_BRANCHES]
-        intent = self._plain(order[:, 0], tick)._replace(arrival=since[np.arange(b) * k + order[:, 0]])
-        when = when.reshape(b, k)
-        for rank in range(order.shape[1]):
-            lost = np.flatnonzero(~np.isfinite(intent.arrival))
-            if not len(lost):
-                break
-            choice = order[lost, rank]
-            better = self._corrected(q[lost], v[lost], choice, when[lost, choice], tick)
-            use = np.isfinite(better.arrival) | (rank == 0)
-            for old, new in zip(intent, better, strict=True):
-                old[lost[use]] = new[use]
-        return intent
+        gains = self._plain(np.tile(np.arange(k), b), tick)
+        many = Intent(*(np.concatenate(pair) for pair in zip(gains, before, strict=True)))
+        machine = np.concatenate([np.repeat(np.arange(b), k), np.arange(b)])
+        home, least, when = self.foresee(q[machine], v[machine], many, tick, machine)
+        best, out = home[: b * k].reshape(b, k).argmin(axis=1), before.of(np.arange(b))
+        first = home[np.arange(b) * k + best]
+        better = first < home[b * k :]
+        out.put(better, self._plain(best[better], tick))
+        lost = np.flatnonzero(~np.isfinite(np.minimum(first, home[b * k :])))
+        if len(lost):
+            near = np.argsort(least[: b * k].reshape(b, k)[lost], axis=1)[:, :_BRANCHES]
+            when = np.take_along_axis(when[: b * k].reshape(b, k)[lost], near, axis=1)
+            out.put(lost, self._corrected(q[lost], v[lost], near, when, tick))
+        return out
 
     def _plain(self, choice: NDArray[np.intp], tick: int) -> Intent:
         b = len(choice)
-        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)), np.full(b, np.inf))
+        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)))
 
     def _corrected(self, q: Array, v: Array, choice: NDArray[np.intp], when: Array, tick: int) -> Intent:
-        """Intentions with added forces that come nearest to the goal, about those that do ``when`` (b,)."""
-        rng, b, p = np.random.default_rng(self.seed), len(q), _SAMPLES
-        limit = min(-self.low[self.a], self.high[self.a])
-        stretch = np.maximum(1.0, np.ceil((when + 1.0) / _PARTS))
-        mean, spread = np.zeros((b, _PARTS)), np.full((b, _PARTS), 0.6 * limit)
-        best = self._plain(choice, tick)._replace(stretch=stretch)
-        score = np.full(b, np.inf)
+        """Intentions of machines (b,) with added forces that arrive first, or come nearest to the goal, about
+        several gains ``choice`` (b, c) each, which came nearest after ``when`` (b, c) ticks."""
+        rng, (b, c), p = np.random.default_rng(self.seed), choice.shape, _SAMPLES
+        limit, rows = min(-self.low[self.a], self.high[self.a]), np.arange(b * c)
+        stretch = np.maximum(1.0, np.ceil((when.ravel() + 1.0) / _PARTS))
+        until = np.repeat(when.ravel(), p) + _CATCHING / self.period
+        mean, spread = np.zeros((b * c, _PARTS)), np.full((b * c, _PARTS), 0.6 * limit)
+        best = self._plain(choice.ravel(), tick)._replace(stretch=stretch)
+        score, machine, sample = np.full(b * c, np.inf), np.repeat(np.arange(b), c * p), np.repeat(rows, p)
         for _ in range(_ROUNDS):
-            extra = mean[:, None] + spread[:, None] * rng.normal(size=(b, p, _PARTS))
+            noise = np.tile(rng.normal(size=(c, p, _PARTS)), (b, 1, 1))  # the same for every machine
+            extra = mean[:, None] + spread[:, None] * noise
             extra[:, 0] = mean
-            many = Intent(
-                np.repeat(choice, p), extra.reshape(b * p, -1), np.repeat(stretch, p),
-                np.full(b * p, float(tick)), np.full(b * p, np.inf),
-            )  # fmt: skip
-            none = np.zeros(b * p, dtype=bool)
-            since, least, _ = self.foresee(np.repeat(q, p, axis=0), np.repeat(v, p, axis=0), many, tick, none)
-            points = np.where(np.isfinite(since), since - 1e12, least).reshape(b, p)
+            many = best.of(sample)._replace(extra=extra.reshape(b * c * p, -1))
+            home, least, _ = self.foresee(q[machine], v[machine], many, tick, machine, until)
+            points = np.where(np.isfinite(home), home - _ARRIVED, least).reshape(b * c, p)
             order = np.argsort(points, axis=1)[:, : max(4, p // 8)]
             elite = np.take_along_axis(extra, order[:, :, None], axis=1)
             mean, spread = elite.mean(axis=1), elite.std(axis=1) + 1e-3 * limit
-            first, rows = order[:, 0], np.arange(b)
-            now = points[rows, first] < score
-            score = np.where(now, points[rows, first], score)
-            best.extra[now] = extra[rows, first][now]
-            best.arrival[now] = since.reshape(b, p)[rows, first][now]
-            if np.isfinite(best.arrival).all():
+            now = points[rows, order[:, 0]] < score
+            score = np.where(now, points[rows, order[:, 0]], score)
+            best.extra[now] = extra[rows, order[:, 0]][now]
+            if (score.reshape(b, c).min(axis=1) < 0.0).all():
                 break
-        return best
+        return best.of(np.arange(b) * c + score.reshape(b, c).argmin(axis=1))
 
     def _inside(self, q: Array) -> Mask:
         """Whether limited joints are in their range."""
@@ -342,24 +353,12 @@ class SwingUp:
         """Forces (b, nv) for a batch of machines q, v (b, n), one sample a period."""
         intent, caught, tick, again = memory
         if tick >= again:
-            intent, again = self._renewed(q, v, intent, caught, tick), tick + round(self.every / self.period)
-        tau, caught = self.force(q, v, intent, tick, caught)
+            away, again = np.flatnonzero(~caught), tick + round(self.every / self.period)
+            if len(away):
+                intent = intent.of(np.arange(len(q)))
+                intent.put(away, self.intend(q[away], v[away], tick, intent.of(away)))
+        tau, caught, _ = self.force(q, v, intent, tick, caught)
         return tau, SwingMemory(intent, caught, tick + 1, again)
-
-    def _renewed(self, q: Array, v: Array, intent: Intent, caught: Mask, tick: int) -> Intent:
-        """Intentions that still lead home are kept, others are made anew."""
-        open_ = np.flatnonzero(~caught)
-        if not len(open_):
-            return intent
-        if tick > 0 and self.foresight > 0.0:
-            part = intent.of(open_)
-            since, _, _ = self.foresee(q[open_], v[open_], part, tick, caught[open_])
-            open_ = open_[~np.isfinite(since)]
-        out = intent.of(np.arange(len(q)))
-        if len(open_):
-            for old, new in zip(out, self.intend(q[open_], v[open_], tick), strict=True):
-                old[open_] = new
-        return out
 
     # ---- the law on one machine
 
