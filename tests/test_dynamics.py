@@ -1,5 +1,6 @@
 """The smooth engine against MuJoCo, closed laws, and exact derivatives."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import mujoco
@@ -7,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from pantograph.sim.compile.jit import preferred_lanes
+from pantograph.sim.curves import keyed
 from pantograph.sim.dynamics import LinearFeedback, compile_model, joint_pd, unsupported
 from pantograph.sim.dynamics.functions import FORMULATIONS, FUNCTIONS
 from pantograph.sim.dynamics.layout import Layout, keyed_joints
+from pantograph.sim.dynamics.prescribed import pieces_of
 from pantograph.sim.dynamics.symbolic import Equations
 from pantograph.sim.errors import EngineError
 from pantograph.sim.integrate import TABLEAUS, solve
@@ -230,9 +233,138 @@ def test_a_keyed_pendulum_carries_the_other_one():
         smooth.forward([0.2], [0.0])
 
 
-@pytest.mark.parametrize("keyed", [["a"], [0], np.array([True, False])])
-def test_keyed_joints_have_names_numbers_or_a_mask(keyed):
-    assert keyed_joints(of_text(SWING), keyed) == (0,)
+def keyed_by(curve):
+    """Motion w(t) of one keyed hinge along a curve."""
+
+    def w(t):
+        s = curve(t)
+        return np.concatenate([s.q, s.v, s.a], axis=1)
+
+    return w
+
+
+@pytest.mark.parametrize("method", ["dopri5", "dop853", "verner98"])
+@pytest.mark.parametrize("told", [True, False], ids=["breaks told", "breaks found"])
+def test_steps_that_follow_a_tolerance_see_keyed_motion_at_every_moment(method, told, arms):
+    """Monotone cubics whose accelerations jump at the keys, against RK4 whose steps end there."""
+    smooth = arms["a"]
+    curve = keyed([0.0, 0.3, 0.7, 1.0], [0.0, 1.2, -0.6, 0.4])
+    breaks = curve.breaks_between(0.0, 1.0) if told else ()
+    times = np.linspace(0.0, 1.0, 41)
+    exact = _between_breaks(smooth, curve, [0.2], [0.0], times)
+    for tolerance, bound in ((1e-5, 3e-4), (1e-11, 1e-9)):
+        path = smooth.integrate(
+            [0.2], [0.0], times, method=TABLEAUS[method], rtol=tolerance, atol=tolerance,
+            w=keyed_by(curve), breaks=breaks,
+        )  # fmt: skip
+        assert path.success
+        assert np.abs(path.x - exact).max() < bound
+    # a method of order p gains little by steps that straddle a break: they are few only when they end there
+    assert path.rejected < 5 + path.evaluations / TABLEAUS[method].stages / 4
+    batch = smooth.integrate(
+        np.full((5, 1), 0.2), [0.0], times, method=TABLEAUS[method], rtol=1e-11, atol=1e-11, w=keyed_by(curve)
+    )
+    np.testing.assert_allclose(batch.x, np.tile(path.x, (5, 1, 1)), rtol=0, atol=1e-10)
+
+
+def _between_breaks(smooth, curve, q, v, times):
+    """States at `times` by small steps of RK4 that see the limits from inside at both ends of each."""
+    x, out = np.concatenate([q, v]), [np.concatenate([q, v])]
+    for t0, t1 in pairwise(times):
+        edges = [t0, *curve.breaks_between(t0, t1), t1]
+        for a, b in pairwise(edges):
+            n = 60
+
+            def w(t, a=a, b=b):
+                left, right = curve(t, left=True), curve(t)
+                at_end = (np.abs(t - b) < 1e-12)[:, None]
+                return np.concatenate(
+                    [np.where(at_end, *pair) for pair in zip(left, right, strict=True)], axis=1
+                )
+
+            x = smooth.rollout(x[:1], x[1:], step=(b - a) / n, steps=n, w=w, t0=a).x[-1]
+        out.append(x)
+    return np.array(out)
+
+
+def test_a_keyed_velocity_that_jumps_pulls_the_others_along():
+    """Linear keys of a slide that carries a pendulum: at rest, then at V: it turns at -V / l afterwards."""
+    smooth = compile_model(of_text(CART), keyed=["cart"], cache=None)
+    curve = keyed([0.0, 0.4, 1.4], [0.0, 0.0, 1.5], kind="linear")
+    times = np.array([0.0, 0.2, 0.4, 0.4 + 1e-9, 0.9])
+    for breaks, first in ((curve.breaks_between(0.0, 0.9), 2), ((), 3)):
+        path = smooth.integrate([0.0], [0.0], times, w=keyed_by(curve), breaks=breaks, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(path.x[:2], 0.0, atol=1e-12)
+        # at the jump itself, where it is known to the last digit, the record is what follows it
+        np.testing.assert_allclose(path.v[first:4, 0], -1.5, atol=1e-7)
+        kept = 0.5 * path.v[first:, 0] ** 2 + 9.81 * (1 - np.cos(path.q[first:, 0]))
+        np.testing.assert_allclose(kept, 0.5 * 1.5**2, atol=1e-8)
+
+
+def test_compiled_laws_and_keyed_motion_run_together_to_a_tolerance(arms):
+    """Breaks between the samples of a controller: neither moves the other."""
+    smooth = arms["a"]
+    curve = keyed([0.0, 0.137, 0.5], [0.0, 0.8, -0.2])
+    K = np.array([[0.0, 0.0], [3.0, 0.4]])
+    law = LinearFeedback(K, q_ref=np.linspace(0, 1, 10)[:, None])
+    times = np.linspace(0.0, 0.5, 11)
+    path = smooth.integrate(
+        [0.2], [0.1], times, law, hold=0.05, w=keyed_by(curve), method=TABLEAUS["dop853"],
+        rtol=1e-12, atol=1e-12,
+    )  # fmt: skip
+    x, u = np.array([0.2, 0.1]), []
+    for k in range(10):
+        u.append(K @ np.array([np.linspace(0, 1, 10)[k] - x[0], -x[1]]))
+        part = smooth.integrate(
+            x[:1], x[1:], times[k : k + 2], u[-1], w=keyed_by(curve), breaks=curve.breaks,
+            method=TABLEAUS["dop853"], rtol=1e-12, atol=1e-12,
+        )  # fmt: skip
+        x = part.x[-1]
+        np.testing.assert_allclose(path.x[k + 1], x, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(path.u, u, rtol=0, atol=1e-9)
+
+
+def test_prescribed_motion_becomes_polynomials_that_agree_to_rounding():
+    smooth_ = lambda t: np.stack([np.sin(7 * t), np.exp(-t) * t**3], axis=1)  # noqa: E731
+    t = np.linspace(0.0, 3.0, 501)
+    pieces = pieces_of(smooth_, 2, 0.0, 3.0)
+    assert not len(pieces.times_of_breaks)
+    np.testing.assert_allclose(pieces(t), smooth_(t), rtol=0, atol=1e-12)
+    # a cubic needs four coefficients and no more
+    cubic = pieces_of(lambda t: (t**3 - 2 * t)[:, None], 1, -1.0, 2.0)
+    assert cubic.coefficients.shape == (1, 1, 4)
+
+    def jumping(t):
+        return np.where(t < 1.2345, np.cos(t), 3.0 - t)[:, None]
+
+    pieces = pieces_of(jumping, 1, 0.0, 3.0)
+    np.testing.assert_allclose(pieces.times_of_breaks, [1.2345], atol=1e-11)
+    np.testing.assert_allclose(pieces(t), jumping(t), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pieces([1.5], left=True), pieces([1.5]))
+    # a jump on a boundary between halves
+    assert pieces_of(lambda t: np.sign(t - 1.5)[:, None], 1, 0.0, 3.0).times_of_breaks.tolist() == [1.5]
+    with pytest.raises(EngineError, match="not finite at t = "):
+        pieces_of(lambda t: np.where(t < 1, t, np.nan)[:, None], 1, 0.0, 3.0)
+    with pytest.raises(EngineError, match=r"shape \(16,\)"):
+        pieces_of(lambda t: t, 1, 0.0, 3.0)
+    with pytest.raises(EngineError, match="too wild"):
+        pieces_of(lambda t: np.random.default_rng(0).normal(size=(len(t), 1)), 1, 0.0, 3.0)
+
+
+CART = """<mujoco><worldbody><body><joint name="cart" type="slide" axis="1 0 0"/>
+ <geom size=".05" mass="1"/><body><joint name="swing" axis="0 -1 0"/>
+ <inertial pos="0 0 -1" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """The swinging arm with one joint keyed."""
+    return {joint: compile_model(of_text(SWING), keyed=[joint], cache=None) for joint in "ab"}
+
+
+@pytest.mark.parametrize("joints", [["a"], [0], np.array([True, False])])
+def test_keyed_joints_have_names_numbers_or_a_mask(joints):
+    assert keyed_joints(of_text(SWING), joints) == (0,)
 
 
 def test_keyed_joints_that_do_not_exist_or_are_cut_in_two_are_refused():
@@ -367,6 +499,26 @@ def test_derivatives_of_a_step_equal_the_step_s_differences(xml):
     for k in range(model.nu):
         close(got.B[:, k], column(du=h * (np.arange(model.nu) == k)), 1e-7)
     close(got.P[:, 0], column(dp=np.array([h])), 1e-7)
+
+
+def test_derivatives_of_a_step_with_keyed_motion_equal_its_differences(arms):
+    smooth = arms["a"]
+    curve = keyed([0.0, 1.0], [0.0, 1.2], kind="clamped")
+    w, t0, h = keyed_by(curve), 0.3, 1e-5
+    got = smooth.step_derivatives([0.2], [0.5], [0.1, 0.3], step=0.05, w=w, t0=t0)
+
+    def end(q=0.2, v=0.5, u=0.3):
+        return smooth.rollout([q], [v], [0.1, u], step=0.05, steps=1, w=w, t0=t0).x[-1]
+
+    close(got.x, end(), 1e-14)
+    for k, name in enumerate(("q", "v")):
+        by = (end(**{name: (0.2, 0.5)[k] + h}) - end(**{name: (0.2, 0.5)[k] - h})) / (2 * h)
+        close(got.A[:, k], by, 1e-7)
+    close(got.B[:, 1], (end(u=0.3 + h) - end(u=0.3 - h)) / (2 * h), 1e-7)
+    still = smooth.step_derivatives([0.2], [0.5], step=0.05, w=[0.0, 0.0, 0.0])
+    assert np.abs(still.x - got.x).max() > 1e-3
+    with pytest.raises(EngineError, match="prescribed motion"):
+        smooth.step_derivatives([0.2], [0.5], step=0.05)
 
 
 def test_the_adjoint_of_the_rate_is_the_transpose_of_its_jacobian():

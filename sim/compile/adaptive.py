@@ -7,33 +7,16 @@ continuous extension.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from .llvm import Emitter
 from .loops import Block, function
+from .pieces import pieces_function, repeat_while
 from .rollout import CONTROL_ARGUMENTS, Control, Shape, advance, combine, normalize, splat
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 8.0
-OK, TOO_MANY_STEPS, STEP_TOO_SMALL = 0.0, 1.0, 2.0
-STATISTICS = ("steps", "rejected", "evaluations", "status", "next_step")
-
-
-@contextmanager
-def repeat_while(e: Emitter) -> Iterator[Any]:
-    """A loop whose body begins by deciding to go on: `yield`s a function that takes the i1 condition."""
-    name = e.label("R")
-    e.do(f"br label %{name}.head")
-    e.lines.append(f"{name}.head:")
-
-    def going(condition: str) -> None:
-        e.do(f"br i1 {condition}, label %{name}.body, label %{name}.exit")
-        e.lines.append(f"{name}.body:")
-
-    yield going
-    e.do(f"br label %{name}.head")
-    e.lines.append(f"{name}.exit:")
+OK, TOO_MANY_STEPS, STEP_TOO_SMALL, GUARDED = 0.0, 1.0, 2.0, 4.0
+STATISTICS = ("steps", "rejected", "evaluations", "status", "next_step", "time")
 
 
 def any_lane(e: Emitter, condition: str) -> str:
@@ -68,14 +51,17 @@ def exp2(e: Emitter, y: str) -> str:
 class _Integrator:
     """Writes the body of one adaptive integration."""
 
-    def __init__(self, method: Any, shape: Shape, lanes: int):
+    def __init__(self, method: Any, shape: Shape, lanes: int, guards: int, pulling: range):
         self.e = e = Emitter(lanes)
-        self.method, self.shape = method, shape
+        self.method, self.shape, self.guards, self.pulling = method, shape, guards, pulling
         self.stages, self.extra = len(method.b), len(method.dense.c)
         nx = shape.nx
         self.X, self.Y, self.XN = e.slot(nx), e.slot(nx), e.slot(nx)
         self.U, self.W, self.P = e.slot(shape.nu), e.slot(shape.nw), e.slot(shape.np)
         self.K = [e.slot(nx) for _ in range(self.stages + self.extra)]
+        self.G, self.G_rate, self.GN, self.GN_rate = (e.slot(guards) for _ in range(4))
+        self.T, self.piece = e.slot(1), e.slot(lanes, "i64")
+        self.first_piece = self.last_piece = "0"
         # clocks and controls of the lanes, in memory
         names = ("t", "t_new", "h", "want", "before", "grow", *STATISTICS[:4])
         self.mem = {name: e.slot(1) for name in names}
@@ -89,17 +75,66 @@ class _Integrator:
     def set(self, name: str, value: str) -> None:
         self.e.store(value, self.mem[name], 0)
 
-    def rate(self, at: str, out: str) -> None:
+    def prescribe(self, t: str) -> None:
+        """The prescribed motion at time `t`."""
+        if self.shape.nw:
+            self.e.store(t, self.T, 0)
+            self.e.do(
+                f"call void @prescribed(ptr {self.T}, ptr {self.piece}, i64 {self.first_piece}, "
+                f"i64 {self.last_piece}, ptr %knots, ptr %coefficients, i64 %terms, ptr {self.W})"
+            )
+
+    def rate(self, at: str, out: str, t: str) -> None:
+        self.prescribe(t)
+        self.evaluate(at, out)
+
+    def evaluate(self, at: str, out: str) -> None:
         e = self.e
         e.do(
             f"call void @rate({self.shape.split(e, at)}, ptr {self.U}, ptr {self.W}, ptr {self.P}, ptr {out})"
         )
 
-    def stage(self, i: int, row: Any, h: str) -> None:
-        """Slope of stage `i` from the ones before it."""
+    def stage(self, i: int, row: Any, node: float, h: str) -> None:
+        """Slope of stage `i` from the ones before it, at its `node`."""
+        e = self.e
         terms = [(float(a), self.K[j]) for j, a in enumerate(row[:i]) if a != 0.0]
-        combine(self.e, self.Y, self.X, h, terms, self.shape.nx)
-        self.rate(self.Y, self.K[i])
+        combine(e, self.Y, self.X, h, terms, self.shape.nx)
+        inside = e.f("fadd", self.get("t"), e.f("fmul", h, e.const(node)))
+        self.rate(self.Y, self.K[i], self.get("t_new") if node == 1.0 else inside)
+
+    def guard(self, at: str, values: str, rates: str) -> None:
+        """The functions that the integration must not pass zero of, and their rates."""
+        e = self.e
+        e.do(
+            f"call void @guard({self.shape.split(e, at)}, ptr {self.U}, ptr {self.W}, ptr {self.P}, "
+            f"ptr %offsets, ptr {values}, ptr {rates})"
+        )
+
+    def hold_back(self, h: str, accept: str) -> str:
+        """The lanes that accept without those where a guard is below zero at the step's end, or may have
+        been in between: it fell at the start and rises at the end, near enough to zero."""
+        e = self.e
+        self.guard(self.XN, self.GN, self.GN_rate)
+        stop = e.compare("one", e.const(0.0), e.const(0.0))
+        for i in range(self.guards):
+            before, after = e.load(self.G, i), e.load(self.GN, i)
+            fall, rise = e.load(self.G_rate, i), e.load(self.GN_rate, i)
+            lower = e.select(e.compare("olt", before, after), before, after)
+            turned = e.emit(
+                f"and {e.B} {e.compare('olt', fall, e.const(0.0))}, {e.compare('ogt', rise, e.const(0.0))}"
+            )
+            near = e.compare("olt", lower, e.f("fmul", h, e.f("fsub", rise, fall)))
+            dipped = e.emit(f"and {e.B} {turned}, {near}")
+            for suspect in (e.compare("olt", after, e.const(0.0)), dipped):
+                stop = e.emit(f"or {e.B} {stop}, {suspect}")
+        stop = e.emit(f"and {e.B} {stop}, {accept}")
+        self.set("status", e.select(stop, e.const(GUARDED), self.get("status")))
+        self.set("want", e.select(stop, h, self.get("want")))
+        accept = e.emit(f"xor {e.B} {accept}, {stop}")
+        for new, old in ((self.GN, self.G), (self.GN_rate, self.G_rate)):
+            for i in range(self.guards):
+                e.store(e.select(accept, e.load(new, i), e.load(old, i)), old, i)
+        return accept
 
     def error(self, weights: Any, h: str) -> str:
         """Sum over components of (estimated error / tolerance)^2."""
@@ -205,7 +240,7 @@ class _Integrator:
         with e.when(e.emit(f"icmp ne i64 {e.get(due)}, 0")):
             first = 0 if self.method.fsal else 1
             for k in range(first, self.extra):
-                self.stage(self.stages + k, self.method.dense.A[k], h)
+                self.stage(self.stages + k, self.method.dense.A[k], float(self.method.dense.c[k]), h)
             more = e.f("fadd", self.get("evaluations"), e.const(float(self.extra - first)))
             self.set("evaluations", e.select(accept, more, self.get("evaluations")))
             with e.loop(e.lanes) as lane, repeat_while(e) as going:
@@ -221,7 +256,8 @@ class _Integrator:
         safe = e.emit(f"select i1 {more}, i64 {index}, i64 0")
         time = e.emit(f"load double, ptr {e.element('%t_eval', safe, 'double')}, align 8")
         reached = e.emit(f"load double, ptr {e.element(self.mem['t_new'], lane, 'double')}, align 8")
-        within = e.emit(f"fcmp ole double {time}, {reached}")
+        # what a step ends with is written by the next one: values may jump in between
+        within = e.emit(f"fcmp olt double {time}, {reached}")
         flag = e.emit(f"load i64, ptr {e.element(flags, lane, 'i64')}, align 8")
         accepted = e.emit(f"icmp ne i64 {flag}, 0")
         both = e.emit(f"and i1 {more}, {within}")
@@ -254,6 +290,38 @@ class _Integrator:
         following = s.emit(f"add nsw i64 {index}, 1")
         s.do(f"store i64 {following}, ptr {s.element(self.index, lane, 'i64')}, align 8")
 
+    def output_end(self) -> None:
+        """States at requested times that are where the lanes have come to."""
+        e = self.e
+        flags = e.slot(e.lanes, "i64")
+        # as if a step of any length began here, and the next number were its end
+        self.set("h", e.const(1.0))
+        ulp = e.f("fadd", e.f("fmul", e.call("fabs", self.get("t")), e.const(2.0**-52)), e.const(5e-324))
+        self.set("t_new", e.f("fadd", self.get("t"), ulp))
+        with e.loop(e.lanes) as lane:
+            e.do(f"store i64 1, ptr {e.element(flags, lane, 'i64')}, align 8")
+            with repeat_while(e) as going:
+                time, waiting = self.next_time(lane, flags)
+                going(waiting)
+                self.write(lane, time)
+
+    def jump(self, number: str) -> None:
+        """Velocities that prescribed joints take up at once pull the others along: dv = -M_pp^-1 M_pk dv_k,
+        the difference of the accelerations with dv_k and with nothing prescribed."""
+        e, s = self.e, self.e.sharing(1)
+        self.prescribe(self.get("t"))
+        row = s.emit(f"mul nsw i64 {number}, {len(self.pulling)}")
+        for slope, pulled in ((self.K[0], True), (self.K[1], False)):
+            for k, at in enumerate(self.pulling):
+                entry = s.element("%jumps", s.emit(f"add nsw i64 {row}, {k}"), "double")
+                value = splat(e, s.emit(f"load double, ptr {entry}, align 8")) if pulled else e.const(0.0)
+                e.store(value, self.W, at)
+            self.evaluate(self.X, slope)
+        sound = e.compare("oeq", self.get("status"), e.const(OK))
+        for i in range(self.shape.nq, self.shape.nq + self.shape.nv):
+            change = e.f("fsub", e.load(self.K[0], i), e.load(self.K[1], i))
+            e.store(e.f("fadd", e.load(self.X, i), e.select(sound, change, e.const(0.0))), self.X, i)
+
     def advance(self, accept: str) -> None:
         """Take over the new state and slope in the lanes that accept."""
         e = self.e
@@ -272,7 +340,9 @@ class _Integrator:
     def period(self, end: str) -> None:
         """Steps up to `end`."""
         e, method = self.e, self.method
-        self.rate(self.X, self.K[0])
+        self.rate(self.X, self.K[0], self.get("t"))
+        if self.guards:
+            self.guard(self.X, self.G, self.G_rate)
         sound = e.compare("oeq", self.get("status"), e.const(OK))
         one_more = e.f("fadd", self.get("evaluations"), e.const(1.0))
         self.set("evaluations", e.select(sound, one_more, self.get("evaluations")))
@@ -282,15 +352,23 @@ class _Integrator:
             h = self.length(end, active)
             self.set("h", h)
             for i in range(1, self.stages):
-                self.stage(i, method.A[i], h)
+                self.stage(i, method.A[i], float(method.c[i]), h)
             terms = [(float(b), k) for b, k in zip(method.b, self.K, strict=False) if b != 0.0]
             advance(e, self.XN, self.X, h, terms, self.shape.nx)
             normalize(e, self.XN, self.shape.quaternions)
             accept = self.judge(h, active)
             if not method.fsal:
-                self.rate(self.XN, self.K[self.last])
+                self.rate(self.XN, self.K[self.last], self.get("t_new"))
+            if self.guards:
+                accept = self.hold_back(h, accept)
             self.output(h, accept)
             self.advance(accept)
+
+    def of_span(self, span: str, k: int) -> str:
+        """Entry `k` of what is known of a span."""
+        e = self.e
+        at = e.emit(f"add nsw i64 {e.emit(f'mul nsw i64 {span}, 4')}, {k}")
+        return e.emit(f"load i64, ptr {e.element('%of_span', at, 'i64')}, align 8")
 
     def batch(self) -> None:
         """All blocks of the batch."""
@@ -304,34 +382,57 @@ class _Integrator:
             for lane, row in enumerate(block.rows):
                 e.do(f"store i64 {row}, ptr {e.element(self.row, lane, 'i64')}, align 8")
                 e.do(f"store i64 %first_eval, ptr {e.element(self.index, lane, 'i64')}, align 8")
+                e.do(f"store i64 0, ptr {e.element(self.piece, lane, 'i64')}, align 8")
             self.set("t", splat(e, "%t0"))
             for name, value in (("before", 0.0), ("grow", GROW), *((s, 0.0) for s in STATISTICS[:4])):
                 self.set(name, e.const(value))
-            with e.loop("%periods") as period:
-                control.hold(period, self.X)
-                after = e.emit(f"add nsw i64 {period}, 1")
-                final = e.emit(f"icmp eq i64 {after}, %periods")
-                number = e.emit(f"sitofp i64 {after} to double")
-                edge = e.emit(f"fadd double %t0, {e.emit(f'fmul double {number}, %hold')}")
-                self.period(splat(e, e.emit(f"select i1 {final}, double %t1, double {edge}")))
+            sampled = e.slot(1, "i64")
+            e.put(sampled, -1)
+            with e.loop("%spans") as span:
+                period, self.first_piece, self.last_piece, jump = (self.of_span(span, k) for k in range(4))
+                with e.when(e.emit(f"icmp ne i64 {period}, {e.get(sampled)}")):
+                    control.hold(period, self.X)
+                    e.put(sampled, period)
+                if self.pulling:
+                    with e.when(e.emit(f"icmp sge i64 {jump}, 0")):
+                        self.jump(jump)
+                edge = e.emit(f"load double, ptr {e.element('%edges', span, 'double')}, align 8")
+                self.period(splat(e, edge))
+            self.output_end()
             block.scatter(self.X, block.pointers("%x1", shape.nx), shape.nx)
-            for k, name in enumerate((*STATISTICS[:4], "want")):
+            for k, name in enumerate((*STATISTICS[:4], "want", "t")):
                 pointers = [e.element(x, k, "double") for x in block.pointers("%stats", len(STATISTICS))]
                 block.scatter(self.mem[name], pointers, 1)
 
 
-def adaptive_steps(name: str, method: Any, shape: Shape, lanes: int) -> str:
+def adaptive_steps(
+    name: str, method: Any, shape: Shape, lanes: int, *, guards: int = 0, pulling: range = range(0)
+) -> str:
     """Integration to a tolerance, as IR.
 
-    `void name(n, periods, t0, t1, hold, rtol, atol, max_steps, x0, h0, controls..., p, p_state, t_eval,
-    count, first_eval, path, x1, stats)`: control periods of `hold` seconds; `path` receives the states at
-    t_eval from index `first_eval` on, `x1` the final states, `stats` the STATISTICS of every state.
+    `void name(n, periods, spans, edges, of_span, t0, rtol, atol, max_steps, x0, h0, controls..., p, p_state,
+    knots, coefficients, terms, jumps, offsets, t_eval, count, first_eval, path, x1, stats)`: no step crosses
+    the end of a span, `edges`; `of_span` says for each span its control period, the first and last piece of
+    the prescribed motion (see `pieces_function`), and which of `jumps` its start is, or -1: changes of the
+    prescribed velocities, whose accelerations are the entries `pulling` of w. `path` receives the states at
+    t_eval from index `first_eval` on, `x1` the final states, `stats` the STATISTICS of every state. With
+    `guards`, the kernel `guard` (q, v, act, u, w, p, offsets) -> values and rates: a state stops before the
+    step that may take a value below zero, with status GUARDED and that step's length as the next one's.
     """
-    writer = _Integrator(method, shape, lanes)
+    writer = _Integrator(method, shape, lanes, guards, pulling)
     writer.batch()
-    arguments = ["i64 %n", "i64 %periods", "double %t0", "double %t1", "double %hold", "double %rtol"]
+    arguments = ["i64 %n", "i64 %periods", "i64 %spans", "ptr noalias %edges", "ptr noalias %of_span"]
+    arguments += ["double %t0", "double %rtol"]
     arguments += ["ptr noalias %atol", "double %max_steps", "ptr noalias %x0", "ptr noalias %h0"]
     arguments += CONTROL_ARGUMENTS
-    arguments += ["ptr noalias %p", "i64 %p_state", "ptr noalias %t_eval", "i64 %count", "i64 %first_eval"]
-    arguments += ["ptr noalias %path", "ptr noalias %x1", "ptr noalias %stats"]
-    return function(name, arguments, writer.e)
+    arguments += ["ptr noalias %p", "i64 %p_state", "ptr noalias %knots", "ptr noalias %coefficients"]
+    arguments += ["i64 %terms", "ptr noalias %jumps", "ptr noalias %offsets", "ptr noalias %t_eval"]
+    arguments += [
+        "i64 %count",
+        "i64 %first_eval",
+        "ptr noalias %path",
+        "ptr noalias %x1",
+        "ptr noalias %stats",
+    ]
+    motion = pieces_function("prescribed", shape.nw, lanes) if shape.nw else ""
+    return motion + function(name, arguments, writer.e)

@@ -115,7 +115,7 @@ def in_parallel(call: Callable[[int, int], None], count: int, lanes: int, thread
         job.result()
 
 
-def address(array: Array) -> int:
+def address(array: NDArray[Any]) -> int:
     """Address of a contiguous array's data (0 of an empty one's)."""
     if not array.size:
         return 0

@@ -1,15 +1,16 @@
 """Smooth dynamics: the equations of motion of a MuJoCo model, written once and turned into machine code."""
 
 from .laws import LinearFeedback, joint_pd
-from .rollouts import STATUS, Path
-from .sensitivity import StepDerivatives
-from .smooth import Derivatives, Smooth, Stats, compile_model
+from .path import STATUS, Path
+from .sensitivity import Derivatives, StepDerivatives
+from .smooth import Inputs, Smooth, Stats, compile_model
 from .stepper import Stepper
 from .support import differences, unsupported
 
 __all__ = [
     "STATUS",
     "Derivatives",
+    "Inputs",
     "LinearFeedback",
     "Path",
     "Smooth",

@@ -9,14 +9,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..integrate.tableau import Tableau
+from .fixed import stage_times
 from .layout import Layout
 from .rigid.tree import BALL, FREE
+from .rows import Prescribed, prescribed_rows
 
 if TYPE_CHECKING:
-    from .rollouts import Start
+    from .rows import Start
     from .smooth import Smooth
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """Accelerations `a` and their derivatives by q (tangent space), v and tau, (..., nv, nv) each."""
+
+    a: Array
+    dq: Array
+    dv: Array
+    dtau: Array
 
 
 @dataclass(frozen=True)
@@ -77,23 +89,33 @@ def _scaled(layout: Layout, x: Array, D: Array) -> Array:
 
 
 def step_derivatives(
-    smooth: Smooth, start: Start, u: ArrayLike | None, *, step: float, method: Tableau, p: ArrayLike | None
+    smooth: Smooth,
+    start: Start,
+    u: ArrayLike | None,
+    *,
+    step: float,
+    method: Tableau,
+    w: Prescribed,
+    p: ArrayLike | None,
+    t0: float,
 ) -> StepDerivatives:
     """Derivatives of one step from each state of `start`; see `Smooth.step_derivatives`."""
     lay, x0 = smooth.layout, start.x
     count, nu, npar = len(x0), lay.nu, len(smooth.parameters)
+    rows = prescribed_rows(smooth, w, lambda: stage_times(method, t0, step, 1), count).array
+    motion = np.broadcast_to(rows, (method.stages, lay.nw)) if rows.ndim < 3 else np.swapaxes(rows, 0, 1)
     E = _tangent_map(lay, x0)
     nt = E.shape[2]
     width = nt + nu + npar
     D0 = np.concatenate([E, np.zeros((count, lay.nx, nu + npar))], axis=2)
     K: list[Array] = []
     DK: list[Array] = []
-    for row in method.A:
+    for row, now in zip(method.A, motion, strict=True):
         x, D = x0.copy(), D0.copy()
         for a, k, dk in zip(row, K, DK, strict=False):
             if a:
                 x, D = x + step * a * k, D + step * a * dk
-        rate, by = _rate(smooth, x, u, p)
+        rate, by = _rate(smooth, x, u, now, p)
         full = by["x"] @ D
         full[:, :, nt : nt + nu] += by["u"]
         full[:, :, nt + nu :] += by["p"]
@@ -109,10 +131,10 @@ def step_derivatives(
 
 
 def _rate(
-    smooth: Smooth, x: Array, u: ArrayLike | None, p: ArrayLike | None
+    smooth: Smooth, x: Array, u: ArrayLike | None, w: Array, p: ArrayLike | None
 ) -> tuple[Array, dict[str, Array]]:
     lay = smooth.layout
     q, v, act = x[:, : lay.nq], x[:, lay.nq : lay.nq + lay.nv], x[:, lay.nq + lay.nv :]
-    out = smooth.evaluate("rate_jacobian", q=q, v=v, act=act, u=u, p=p)
+    out = smooth.evaluate("rate_jacobian", q=q, v=v, act=act, u=u, w=w, p=p)
     widths = {"x": lay.nx, "u": lay.nu, "p": len(smooth.parameters)}
     return out["rate"], {name: out["d" + name].reshape(len(x), lay.nx, n) for name, n in widths.items()}

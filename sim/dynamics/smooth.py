@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import mujoco
 import numpy as np
@@ -22,57 +22,38 @@ from numpy.typing import ArrayLike, NDArray
 from ..compile import jit
 from ..compile.cache import Cache, default_folder, key_of
 from ..compile.program import Bound, Build, Program, map_source, obtain, workers
-from ..errors import EngineError
+from ..errors import EngineError, unknown
 from ..integrate.tableau import Tableau
 from ..integrate.tableaus import DOPRI5, RK4
+from .adaptive import adaptive
 from .fields import Parameter, parameter_index
+from .fingerprint import code_fingerprint, model_fingerprint
+from .fixed import fixed
 from .functions import FUNCTIONS, cheaper_formulation
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
+from .loops import PARALLEL_OPERATIONS, Loop
+from .path import Path
 from .problem import SmoothProblem
-from .rollouts import Controls, Loop, Path, Prescribed, PythonLaw, adaptive, fixed, initial_states
-from .sensitivity import StepDerivatives, step_derivatives
+from .rows import NO_MOTION, Controls, Prescribed, PythonLaw, Rows, initial_states
+from .sensitivity import Derivatives, StepDerivatives, step_derivatives
 from .support import differences, unsupported
 from .symbolic import Equations
 
 Array = NDArray[np.float64]
 
-_MODEL_PREFIXES = (
-    "body_",
-    "jnt_",
-    "dof_",
-    "actuator_",
-    "tendon_",
-    "wrap_",
-    "qpos",
-    "eq_",
-    "site_",
-    "geom_fluid",
-)
-_PARALLEL_OPERATIONS = 400_000  # work below which one thread is quicker
 
+class Inputs(TypedDict, total=False):
+    """What most functions take beside q, v and u, zero (p: the model's own values) where it is not given.
 
-def model_fingerprint(model: mujoco.MjModel) -> bytes:
-    """Everything of a model that its smooth dynamics can depend on, as bytes."""
-    parts = []
-    for name in dir(model):
-        if name.startswith(_MODEL_PREFIXES):
-            value = getattr(model, name)
-            if isinstance(value, np.ndarray):
-                parts.append(
-                    name.encode() + str(value.shape).encode() + np.ascontiguousarray(value).tobytes()
-                )
-    option = model.opt
-    numbers = [*option.gravity, *option.wind, option.density, option.viscosity, model.stat.extent]
-    flags = [option.disableflags, option.disableactuator, option.enableflags]
-    return b"\0".join(parts) + np.asarray(numbers).tobytes() + np.asarray(flags, np.int64).tobytes()
+    `act` activations (na,); `tau` additional generalized forces on the state's freedoms (nv,); `w` the
+    prescribed motion (nw,), needed with keyed joints; `p` parameters. A batch has a leading axis.
+    """
 
-
-def _code_fingerprint() -> str:
-    """Hash of this engine's own source: another version never reads what this one compiled."""
-    here = FilePath(__file__).parent
-    files = sorted([*here.rglob("*.py"), *(here.parent / "compile").glob("*.py")])
-    return key_of(*(file.read_bytes() for file in files))
+    act: ArrayLike | None
+    tau: ArrayLike | None
+    w: ArrayLike | None
+    p: ArrayLike | None
 
 
 @dataclass(frozen=True)
@@ -174,6 +155,10 @@ class Smooth:
         self.cache = cache
         self._programs: dict[tuple[str, int], Program] = {}
         self.loops: dict[tuple[Any, ...], Loop] = {}
+        self.still, self.own_parameters = Rows(np.zeros(layout.nu)), Rows(self.parameter_values)
+        sizes = {"q": layout.nq, "v": layout.nv, "act": layout.na, "u": layout.nu, "tau": layout.nv}
+        sizes |= {"a": layout.nv, "w": layout.nw, "p": len(parameters), "bar": max(layout.nx, layout.nv)}
+        self._sizes = sizes
 
     @cached_property
     def key(self) -> str:
@@ -181,7 +166,7 @@ class Smooth:
         lay = self.layout
         roles = repr((lay.keyed, lay.timed, lay.forces, self.parameters, self.friction_width))
         versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
-        return key_of(model_fingerprint(self.model), roles, versions, _code_fingerprint())
+        return key_of(model_fingerprint(self.model), roles, versions, code_fingerprint())
 
     @cached_property
     def equations(self) -> Equations:
@@ -230,9 +215,7 @@ class Smooth:
             if name == "p":
                 return self.parameter_values
             if name == "w" and size:
-                raise EngineError(
-                    "keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints"
-                )
+                raise EngineError(NO_MOTION)
             return np.zeros(size)
         array = np.ascontiguousarray(value, dtype=np.float64)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
@@ -241,9 +224,10 @@ class Smooth:
 
     def evaluate(self, name: str, **arguments: ArrayLike | None) -> dict[str, Array]:
         """Outputs of function `name` of FUNCTIONS by name, flat; a batch if any argument is one."""
-        sizes = {"q": self.layout.nq, "v": self.layout.nv, "act": self.layout.na, "u": self.layout.nu}
-        sizes |= {"tau": self.layout.nv, "a": self.layout.nv, "w": self.layout.nw, "p": len(self.parameters)}
-        sizes["bar"] = max(self.layout.nx, self.layout.nv)
+        sizes = self._sizes
+        for key in arguments:
+            if key not in sizes:
+                raise EngineError(unknown("argument", key, sizes, where=f"function {name!r}"))
         rows = {key: self._rows(key, value, sizes[key]) for key, value in arguments.items()}
         counts = {len(x) for x in rows.values() if x.ndim == 2}
         if len(counts) > 1:
@@ -253,22 +237,14 @@ class Smooth:
         program = self.program(name, 1 if count == 1 else self.lanes)
         arrays = [rows[key] if key in rows else self._rows(key, None, sizes[key]) for key in program.inputs]
         work = count * program.build.operations
-        outs = program(arrays, count, self.threads if work > _PARALLEL_OPERATIONS else 1)
+        outs = program(arrays, count, self.threads if work > PARALLEL_OPERATIONS else 1)
         return {key: out[0] if single else out for key, out in zip(program.outputs, outs, strict=True)}
 
     def forward(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        act: ArrayLike | None = None,
-        tau: ArrayLike | None = None,
-        w: ArrayLike | None = None,
-        p: ArrayLike | None = None,
+        self, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
     ) -> Array:
-        """Accelerations [rad/s^2, m/s^2] under controls `u` and additional generalized forces `tau`."""
-        return self.evaluate("forward", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)["a"]
+        """Accelerations [rad/s^2, m/s^2] under controls `u` (see `Inputs` for the rest)."""
+        return self.evaluate("forward", q=q, v=v, u=u, **inputs)["a"]
 
     def inverse(
         self,
@@ -283,22 +259,14 @@ class Smooth:
         return self.evaluate("inverse", q=q, v=v, a=a, w=w, p=p)["tau"]
 
     def drive(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        act: ArrayLike | None = None,
-        tau: ArrayLike | None = None,
-        w: ArrayLike | None = None,
-        p: ArrayLike | None = None,
+        self, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
     ) -> Array:
         """Forces that the drives of the keyed freedoms give beside their actuators and passive forces."""
-        return self.evaluate("drive", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)["drive"]
+        return self.evaluate("drive", q=q, v=v, u=u, **inputs)["drive"]
 
     def mass_matrix(self, q: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
         """Inertia matrix, shape (..., nv, nv)."""
-        return _square(self.evaluate("mass_matrix", q=q, w=w, p=p)["M"], self.layout.nv)
+        return _matrix(self.evaluate("mass_matrix", q=q, w=w, p=p)["M"], self.layout.nv)
 
     def energy(
         self, q: ArrayLike, v: ArrayLike, *, w: ArrayLike | None = None, p: ArrayLike | None = None
@@ -323,55 +291,27 @@ class Smooth:
         return out["p"].reshape(*lead, -1, 3), out["R"].reshape(*lead, -1, 3, 3)
 
     def derivatives(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        act: ArrayLike | None = None,
-        tau: ArrayLike | None = None,
-        w: ArrayLike | None = None,
-        p: ArrayLike | None = None,
+        self, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
     ) -> Derivatives:
         """Exact derivatives of `forward` by q (tangent space), v, tau."""
-        out = self.evaluate("derivatives", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)
-        n = self.layout.nv
-        return Derivatives(out["a"], _square(out["dq"], n), _square(out["dv"], n), _square(out["dtau"], n))
+        out, n = self.evaluate("derivatives", q=q, v=v, u=u, **inputs), self.layout.nv
+        return Derivatives(out["a"], *(_matrix(out[key], n) for key in ("dq", "dv", "dtau")))
 
     def control_derivatives(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        act: ArrayLike | None = None,
-        tau: ArrayLike | None = None,
-        w: ArrayLike | None = None,
-        p: ArrayLike | None = None,
+        self, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
     ) -> dict[str, Array]:
         """Exact derivatives of `forward` by "act", "u" and "p", shapes (..., nv, n)."""
-        out = self.evaluate("control_derivatives", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p)
-        sizes = {"act": self.layout.na, "u": self.layout.nu, "p": len(self.parameters)}
-        n = self.layout.nv
-        return {key: out["d" + key].reshape(*out["d" + key].shape[:-1], n, m) for key, m in sizes.items()}
+        out = self.evaluate("control_derivatives", q=q, v=v, u=u, **inputs)
+        return {key: _matrix(out["d" + key], self.layout.nv) for key in ("act", "u", "p")}
 
     def vjp(
-        self,
-        bar: ArrayLike,
-        q: ArrayLike,
-        v: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        act: ArrayLike | None = None,
-        tau: ArrayLike | None = None,
-        w: ArrayLike | None = None,
-        p: ArrayLike | None = None,
+        self, bar: ArrayLike, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
     ) -> dict[str, Array]:
         """bar^T times the derivatives of `forward` by "q" (tangent space), "v", "act", "u", "tau", "p"."""
         wide = np.asarray(bar, dtype=float)
         spare = max(self.layout.nx, self.layout.nv) - wide.shape[-1]
         wide = np.concatenate([wide, np.zeros((*wide.shape[:-1], spare))], axis=-1)
-        return self.evaluate("vjp", q=q, v=v, act=act, u=u, tau=tau, w=w, p=p, bar=wide)
+        return self.evaluate("vjp", q=q, v=v, u=u, bar=wide, **inputs)
 
     def rollout(
         self,
@@ -397,24 +337,18 @@ class Smooth:
         `w` prescribes the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), evaluated at the
         stages' times. Raises EngineError for shapes that do not fit.
         """
-        one_row = controls is None or (not callable(controls) and np.ndim(controls) == 1)  # type: ignore[arg-type]
-        hold = hold or (steps if one_row and not isinstance(controls, LinearFeedback) else 1)
+        if hold is None:
+            sampled = isinstance(controls, LinearFeedback) or callable(controls)
+            one_row = not sampled and (controls is None or np.ndim(controls) == 1)  # type: ignore[arg-type]
+            hold = steps if one_row else 1
         for name, value in (("hold", hold), ("every", every)):
             if value < 1 or steps % value:
                 raise EngineError(f"{name} is {value} steps, which must divide the {steps} steps of the run")
+        start = initial_states(self, q0, v0, act0)
         return fixed(
-            self,
-            initial_states(self, q0, v0, act0),
-            method=method,
-            step=float(step),
-            steps=steps,
-            controls=controls,
-            hold=hold,
-            every=every,
-            w=w,
-            p=p,
-            t0=t0,
-        )
+            self, start, method=method, step=float(step), steps=steps, controls=controls, hold=hold,
+            every=every, w=w, p=p, t0=t0,
+        )  # fmt: skip
 
     def integrate(
         self,
@@ -428,6 +362,8 @@ class Smooth:
         atol: float | Array = 1e-6,
         hold: float | None = None,
         act0: ArrayLike | None = None,
+        w: Prescribed = None,
+        breaks: ArrayLike = (),
         p: ArrayLike | None = None,
         first_step: float | None = None,
         max_steps: int = 1_000_000,
@@ -435,32 +371,20 @@ class Smooth:
         """Integrate from t_eval[0] to t_eval[-1] with steps that follow the tolerances, compiled whole.
 
         The states at `t_eval` [s] (ascending) come from the method's continuous extension. `controls` as for
-        `rollout`, held over `hold` seconds (None: the whole span). Raises EngineError for shapes that do not
-        fit, for a method without an error estimate and for keyed joints (use `rollout`, or `problem` with
-        `sim.integrate.solve`).
+        `rollout`, held over `hold` seconds (None: the whole span), without functions. `w` prescribes the
+        keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), which is taken over as polynomials;
+        no step crosses its `breaks` [s], where it or a derivative jumps (found where they are not given), and
+        prescribed velocities that jump pull the others along. A batch shares them. Raises EngineError for
+        shapes that do not fit and for a method without an error estimate.
         """
         times = np.ascontiguousarray(t_eval, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
             raise EngineError("t_eval must hold two or more ascending times")
-        if not method.adaptive:
-            raise EngineError(f"{method.name} does not estimate its error: use rollout with a fixed step")
-        if self.layout.keyed:
-            raise EngineError(
-                "integrate does not take keyed joints: use rollout, or problem with integrate.solve"
-            )
+        start = initial_states(self, q0, v0, act0)
         return adaptive(
-            self,
-            initial_states(self, q0, v0, act0),
-            times,
-            method=method,
-            rtol=float(rtol),
-            atol=atol,
-            controls=controls,
-            hold=hold,
-            p=p,
-            first_step=first_step,
-            max_steps=max_steps,
-        )
+            self, start, times, method=method, rtol=float(rtol), atol=atol, controls=controls, hold=hold, w=w,
+            breaks=breaks, p=p, first_step=first_step, max_steps=max_steps,
+        )  # fmt: skip
 
     def step_derivatives(
         self,
@@ -471,15 +395,16 @@ class Smooth:
         step: float,
         method: Tableau = RK4,
         act: ArrayLike | None = None,
+        w: Prescribed = None,
         p: ArrayLike | None = None,
+        t0: float = 0.0,
     ) -> StepDerivatives:
         """Exact derivatives of one step of `method` by state (tangent space), control and parameters.
 
-        One state (1-D arrays) or a batch. Keyed joints are not taken (EngineError).
+        One state (1-D arrays) or a batch; `w` prescribes the keyed joints as for `rollout`, from `t0` on.
         """
-        if self.layout.keyed:
-            raise EngineError("step_derivatives does not take keyed joints")
-        return step_derivatives(self, initial_states(self, q, v, act), u, step=step, method=method, p=p)
+        start = initial_states(self, q, v, act)
+        return step_derivatives(self, start, u, step=step, method=method, w=w, p=p, t0=t0)
 
     def problem(
         self, controls: ArrayLike | PythonLaw | None = None, *, w: Prescribed = None
@@ -488,15 +413,6 @@ class Smooth:
         return SmoothProblem(self, controls, w)
 
 
-@dataclass(frozen=True)
-class Derivatives:
-    """Accelerations `a` and their derivatives by q (tangent space), v and tau, (..., nv, nv) each."""
-
-    a: Array
-    dq: Array
-    dv: Array
-    dtau: Array
-
-
-def _square(flat: Array, n: int) -> Array:
-    return flat.reshape(*flat.shape[:-1], n, n)
+def _matrix(flat: Array, rows: int) -> Array:
+    columns = flat.shape[-1] // rows if rows else 0
+    return flat.reshape(*flat.shape[:-1], rows, columns)

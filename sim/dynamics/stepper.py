@@ -1,4 +1,4 @@
-"""Fixed steps of one state, called again and again: between a controller's samples, up to an event."""
+"""Integration of one state, called again and again: between a controller's samples, up to an event."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compile.program import address
-from ..compile.rollout import fixed_steps, live_stages
 from ..integrate.tableau import Tableau
-from .rollouts import _FIXED, compiled_loop
+from .fixed import fixed_loop
 
 if TYPE_CHECKING:
     from .smooth import Smooth
@@ -30,13 +29,14 @@ class Stepper:
 
     def __init__(self, smooth: Smooth, method: Tableau, most: int):
         lay = smooth.layout
-        self._run = compiled_loop(smooth, "fixed", 1, None, method, fixed_steps, _FIXED).run
+        loop = fixed_loop(smooth, 1, None, method)
+        self._run = loop.run
         self._x, self._u = np.zeros(lay.nx), np.zeros(lay.nu)
         self._path, self._none = np.empty((most + 1, lay.nx)), np.zeros(max(1, lay.nw))
         self._parameters = np.ascontiguousarray(smooth.parameter_values)
         self._at = [address(a) for a in (self._x, self._u, self._path, self._none, self._parameters)]
         self._nw = lay.nw
-        self.stages, self.rows = len(live_stages(method.A, method.b)), len(method.c)
+        self.stages, self.rows = loop.stages, len(method.c)
 
     def __call__(self, x: Array, u: Array, steps: int, step: float, w: Array | None = None) -> Array:
         """States (steps + 1, nx) from `x` (nx,) under held controls `u` (nu,), `step` seconds apart.

@@ -1,0 +1,255 @@
+"""Integration in steps that follow a tolerance, compiled whole."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..compile.adaptive import GUARDED, STATISTICS, adaptive_steps
+from ..compile.program import address, in_parallel
+from ..errors import EngineError
+from ..integrate.tableau import Tableau
+from .laws import LinearFeedback
+from .layout import Layout
+from .loops import Guards, Loop, compiled_loop, finish
+from .path import Path
+from .prescribed import Pieces, constant, pieces_of
+from .rows import NO_MOTION, NOTHING, Controls, Prescribed, Start, control_rows, parameter_rows
+
+if TYPE_CHECKING:
+    from .smooth import Smooth
+
+Array = NDArray[np.float64]
+
+_KINDS = "qqqPPddPdPPPqqPqPPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
+JUMP = 1e-9
+"""A prescribed velocity that changes by less than this part of itself does not jump."""
+
+
+def adaptive_loop(
+    smooth: Smooth, lanes: int, law: LinearFeedback | None, method: Tableau, guards: Guards | None = None
+) -> Loop:
+    """The compiled integration to a tolerance."""
+    if not method.adaptive:
+        raise EngineError(f"{method.name} does not estimate its error: use rollout with a fixed step")
+    lay = smooth.layout
+    first = len(lay.q_keyed) + len(lay.v_keyed)
+    return compiled_loop(
+        smooth, "adaptive", lanes, law, method, adaptive_steps, _KINDS, guards=guards,
+        pulling=range(first, first + len(lay.v_keyed)),
+    )  # fmt: skip
+
+
+def motion_of(smooth: Smooth, w: Prescribed, t0: float, t1: float, breaks: ArrayLike = ()) -> Pieces:
+    """The prescribed motion `w`, a row or a function of time, from t0 to t1."""
+    size = smooth.layout.nw
+    if w is None:
+        if size:
+            raise EngineError(NO_MOTION)
+        return constant(np.zeros(0), t0, t1)
+    if callable(w):
+        return pieces_of(w, size, t0, t1, breaks)
+    value = np.asarray(w, dtype=float)
+    if value.shape != (size,):
+        raise EngineError(
+            f"w has shape {value.shape}; steps that follow a tolerance take a row ({size},) or a function"
+        )
+    return constant(value, t0, t1)
+
+
+class Spans:
+    """Time between the moments that no step may cross: samples of the controller, breaks of the motion."""
+
+    def __init__(self, smooth: Smooth, motion: Pieces):
+        lay = smooth.layout
+        self.motion = motion
+        self.breaks = self.times_of_jumps = motion.knots[:0]
+        self.jumps = NOTHING.array
+        if len(motion.knots) > 2:
+            self._find(lay, motion)
+
+    def _find(self, lay: Layout, motion: Pieces) -> None:
+        """Breaks of the motion, and jumps of its velocities."""
+        velocities = slice(len(lay.q_keyed), len(lay.q_keyed) + len(lay.v_keyed))
+        c = motion.coefficients
+        before, after = c[:-1, velocities].sum(axis=2), c[1:, velocities].copy()
+        after[:, :, 1::2] *= -1.0
+        change = after.sum(axis=2) - before
+        sudden = (np.abs(change) > JUMP * (1.0 + np.abs(before))).any(axis=1)
+        self.jumps = np.ascontiguousarray(change[sudden])
+        self.times_of_jumps = motion.knots[1:-1][sudden]
+        breaks = np.union1d(motion.breaks, np.flatnonzero(sudden) + 1).astype(int)
+        self.breaks = motion.knots[breaks]
+
+    def between(
+        self, t0: float, t1: float, hold: float | None = None, periods: int = 1, *, jump: bool = True
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Ends of the spans from t0 to t1, and of each its period, pieces and jump (see `adaptive_steps`).
+
+        `jump` tells whether one at t0 is still to come.
+        """
+        if len(self.motion.knots) == 2:
+            edges: Array = t0 + (t1 - t0 if hold is None else hold) * np.arange(1.0, periods + 1)
+            edges[-1] = t1
+            known = np.zeros((periods, 4), np.int64)
+            known[:, 0], known[:, 3] = np.arange(periods), -1
+            return edges, known
+        inner = self.breaks[(self.breaks > t0) & (self.breaks < t1)]
+        fixed = np.append(inner, t1)
+        if hold is not None:
+            ticks = t0 + hold * np.arange(1, periods)
+            near = np.abs(ticks[:, None] - fixed).min(axis=1) < 1e-12 * max(abs(t0), abs(t1))
+            fixed = np.sort(np.concatenate([fixed, ticks[~near & (ticks < t1)]]))
+        begin = np.append(t0, fixed[:-1])
+        table = np.zeros((len(fixed), 4), np.int64)
+        if hold is not None:
+            table[:, 0] = np.clip((0.5 * (begin + fixed) - t0) // hold, 0, periods - 1)
+        knots, last = self.motion.knots, len(self.motion.knots) - 2
+        table[:, 1] = np.clip(np.searchsorted(knots, begin, "right") - 1, 0, last)
+        table[:, 2] = np.clip(np.searchsorted(knots, fixed, "left") - 1, 0, last)
+        table[:, 3] = self._jump_at(begin)
+        if not jump:
+            table[0, 3] = -1
+        return np.ascontiguousarray(fixed), table
+
+    def _jump_at(self, t: Array) -> NDArray[np.int64]:
+        at = np.searchsorted(self.times_of_jumps, t)
+        found = np.isin(t, self.times_of_jumps)
+        return np.where(found, at, -1)
+
+
+def adaptive(
+    smooth: Smooth,
+    start: Start,
+    t_eval: Array,
+    *,
+    method: Tableau,
+    rtol: float,
+    atol: float | Array,
+    controls: Controls,
+    hold: float | None,
+    w: Prescribed,
+    breaks: ArrayLike,
+    p: ArrayLike | None,
+    first_step: float | None,
+    max_steps: int,
+) -> Path:
+    """See `Smooth.integrate`."""
+    nx, nu, count = smooth.layout.nx, smooth.layout.nu, len(start.x)
+    t0, t1 = float(t_eval[0]), float(t_eval[-1])
+    periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
+    law, rows, gains = control_rows(smooth, controls, periods, count)
+    parameters = parameter_rows(smooth, p, count)
+    lanes = 1 if count == 1 else smooth.lanes
+    loop = adaptive_loop(smooth, lanes, law, method)
+    spans = Spans(smooth, motion_of(smooth, w, t0, t1, breaks))
+    edges, of_span = spans.between(t0, t1, hold, periods)
+    motion, tolerance = spans.motion, np.full(nx, atol, dtype=float)
+    path = np.full((count, len(t_eval), nx), np.nan)
+    last, stats = np.empty_like(start.x), np.zeros((count, len(STATISTICS)))
+    h0 = np.full(count, first_step or min(t1 - t0, hold or math.inf) * 1e-3)
+    applied = np.empty((count, periods, nu)) if law is not None else NOTHING.array
+    shared = [
+        address(a)
+        for a in (edges, of_span, tolerance, motion.knots, motion.coefficients, spans.jumps, t_eval)
+    ]
+    own = [address(a) for a in (start.x, h0, path, last, stats, applied)]
+
+    def call(first: int, size: int) -> None:
+        at_edges, at_spans, at_tolerance, at_knots, at_coefficients, at_jumps, at_times = shared
+        strides = (nx, 1, len(t_eval) * nx, nx, len(STATISTICS), periods * nu)
+        x0, h, out, x1, facts, u = (at + 8 * first * stride for at, stride in zip(own, strides, strict=True))
+        loop.run(
+            size, periods, len(edges), at_edges, at_spans, t0, rtol, at_tolerance, float(max_steps), x0, h,
+            rows.at(first), rows.per_state, rows.per_row, gains.at(first), gains.per_state, u,
+            parameters.at(first), parameters.per_state, at_knots, at_coefficients, motion.terms, at_jumps, 0,
+            at_times, len(t_eval), 0, out, x1, facts,
+        )  # fmt: skip
+
+    begin = time.perf_counter()
+    in_parallel(call, count, lanes, smooth.threads if count > lanes else 1)
+    seconds = time.perf_counter() - begin
+    shown = applied if law is not None else rows.shown(count)
+    _, rejected, evaluations, status = stats.astype(np.int64).T[:4]
+    times = t_eval.view()
+    times.flags.writeable = False
+    return finish(smooth, start, times, path, shown, evaluations, seconds, rejected=rejected, status=status)
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """Where a call of `Follower` has come to: x (nx,) at t [s], the next step `h`, records from `first` on.
+
+    `guarded`: it stands before a step of length `h` in which a guard may be passed.
+    `failed` says why it went no further, "" if it did not fail.
+    """
+
+    x: Array
+    t: float
+    h: float
+    records: Array
+    first: int
+    evaluations: int
+    guarded: bool
+    failed: str
+
+
+class Follower:
+    """Compiled steps of one state that follow a tolerance, called again and again; one thread at a time.
+
+    Records are the states at `t_eval`; a call from t0 to t1 makes those in t0 <= t < t1.
+    """
+
+    def __init__(
+        self, smooth: Smooth, method: Tableau, motion: Pieces, t_eval: Array, tolerance: float,
+        guards: Guards | None = None, *, max_steps: int = 10_000_000,
+    ) -> None:  # fmt: skip
+        nx = smooth.layout.nx
+        self.spans, self._loop = Spans(smooth, motion), adaptive_loop(smooth, 1, None, method, guards)
+        self._rtol, self._max_steps, self._times = tolerance, float(max_steps), t_eval
+        self._x, self._u, self._h = np.zeros(nx), np.zeros(max(1, smooth.layout.nu)), np.zeros(1)
+        self._path, self._x1 = np.zeros((len(t_eval), nx)), np.zeros(nx)
+        self._stats, self._tolerance = np.zeros(len(STATISTICS)), np.full(nx, tolerance)
+        self._offsets = np.zeros(guards.count if guards else 1)
+        self._parameters = smooth.own_parameters
+
+    def __call__(
+        self,
+        x: Array,
+        u: Array,
+        t0: float,
+        t1: float,
+        h: float,
+        *,
+        offsets: ArrayLike = 0.0,
+        jump: bool = True,
+    ) -> Reached:
+        """From `x` (nx,) at t0 to t1 or before a guard, under held controls `u` (nu,), first step `h`.
+
+        `offsets` are added to the guards; `jump` tells whether a jump of prescribed velocities at t0 is due.
+        """
+        from ..compile.adaptive import OK
+        from .path import STATUS
+
+        self._x[:], self._u[: len(u)], self._h[0], self._offsets[:] = x, u, h, offsets
+        edges, of_span = self.spans.between(t0, t1, jump=jump)
+        first, last = np.searchsorted(self._times, (t0, t1)).tolist()
+        motion, at = self.spans.motion, address
+        self._loop.run(
+            1, 1, len(edges), at(edges), at(of_span), t0, self._rtol, at(self._tolerance), self._max_steps,
+            at(self._x), at(self._h), at(self._u), 0, 0, 0, 0, 0, at(self._parameters.array), 0,
+            at(motion.knots), at(motion.coefficients), motion.terms, at(self.spans.jumps), at(self._offsets),
+            at(self._times), last, first, at(self._path), at(self._x1), at(self._stats),
+        )  # fmt: skip
+        _, _, evaluations, status, following, t = self._stats.tolist()
+        end = int(np.searchsorted(self._times[:last], t, "right" if t < t1 else "left"))
+        failed = "" if status in (OK, GUARDED) else STATUS[int(status)]
+        return Reached(
+            self._x1.copy(), t, following, self._path[first:end].copy(), first, int(evaluations),
+            status == GUARDED, failed,
+        )  # fmt: skip
