@@ -331,6 +331,10 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
     if setup.overruled:
         first = scene.models[0].name
         out.append(f"options of further models: {', '.join(setup.overruled)} are those of {first!r}")
+    for name, kept in setup.floors.items():
+        of, by = (float(setup.model.geom(n).friction[0]) for n in (name, kept))
+        other = "" if of == by else f" (friction {by:g} instead of {of:g})"
+        out.append(f"floor {name!r}: {kept!r} is the same plane and stands for it{other}")
     if engine == "kinematic":
         out.append(
             "all dynamics: nothing but keys moves; recorded frames are checked for overlaps and limits"

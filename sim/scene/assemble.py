@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...models import captured_warnings, chain, load_spec
 from ..errors import ModelError, unknown
+from .floors import Floors, name_planes
 from .mistakes import Mistake
 from .schema import ModelItem, Placement, PropItem, Scene
 
@@ -61,6 +62,7 @@ def _host(specs: list[tuple[ModelItem, mujoco.MjSpec]], scene: Scene) -> mujoco.
         if i == 0:
             _copy_options(child, host)
         frame = host.worldbody.add_frame(pos=item.position, quat=_quat(item, scene))
+        name_planes(child)
         with captured_warnings():  # of options that differ; compiling repeats them
             host.attach(child, prefix=f"{item.name}/", frame=frame)
     return host
@@ -164,8 +166,9 @@ def _is_origin(item: Placement) -> bool:
     return item.position == (0.0, 0.0, 0.0) and item.euler is None and item.rotation in (None, (1, 0, 0, 0))
 
 
-def apply_contacts(spec: mujoco.MjSpec, model: mujoco.MjModel, scene: Scene) -> list[Mistake]:
-    """Write the scene's choice of contacts into the spec; ``model`` is the same spec compiled."""
+def apply_contacts(spec: mujoco.MjSpec, model: mujoco.MjModel, scene: Scene, floors: Floors) -> list[Mistake]:
+    """Write the scene's choice of contacts into the spec; ``model`` is the same spec compiled, ``floors`` are
+    planes for which others stand."""
     choice = scene.physics.contacts
     if choice == "none":
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -176,9 +179,9 @@ def apply_contacts(spec: mujoco.MjSpec, model: mujoco.MjModel, scene: Scene) -> 
     for i, names in enumerate(choice):
         sides = []
         for j, name in enumerate(names):
-            geoms = _geoms_of(model, name)
+            geoms = _geoms_of(model, name, floors)
             if not geoms:
-                mistakes.append(Mistake(("physics", "contacts", i, j), _untouchable(model, name)))
+                mistakes.append(Mistake(("physics", "contacts", i, j), _untouchable(model, name, floors)))
             sides.append(geoms)
         pairs |= {(min(a, b), max(a, b)) for a in sides[0] for b in sides[1] if a != b}
     shapes = list(spec.geoms)
@@ -200,7 +203,7 @@ def name_everything(spec: mujoco.MjSpec) -> None:
                 thing.name = f"{kind}{thing.id}"
 
 
-def _geoms_of(model: mujoco.MjModel, name: str) -> list[int]:
+def _geoms_of(model: mujoco.MjModel, name: str, floors: Floors) -> list[int]:
     """Geoms that a name of a body or geom means; visual geoms never touch."""
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
     if body >= 0:
@@ -209,15 +212,17 @@ def _geoms_of(model: mujoco.MjModel, name: str) -> list[int]:
     else:
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         found = range(geom, geom + 1) if geom >= 0 else range(0)
-    return [g for g in found if model.geom_contype[g] or model.geom_conaffinity[g]]
+    named = [model.geom(g).name for g in found]
+    standing = dict.fromkeys(model.geom(floors.get(n, n)).id for n in named)
+    return [g for g in standing if model.geom_contype[g] or model.geom_conaffinity[g]]
 
 
-def _untouchable(model: mujoco.MjModel, name: str) -> str:
+def _untouchable(model: mujoco.MjModel, name: str, floors: Floors) -> str:
     """Why nothing can touch a body or geom of this name."""
     names = {model.body(b).name for b in range(model.nbody)} | {
         model.geom(g).name for g in range(model.ngeom)
     }
-    touching = [n for n in names if _geoms_of(model, n)]
+    touching = [n for n in names if _geoms_of(model, n, floors)]
     if name not in names:
         return unknown("body or geom", name, touching, where="of those that can touch, the scene")
     return f"{name!r} has no geom that can touch; these have: {', '.join(sorted(touching)) or 'none'}"

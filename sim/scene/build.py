@@ -18,6 +18,7 @@ from ..engines.prescribe import prescribed_bodies
 from ..errors import PantographError, SceneError
 from ..kinds import BALL, FREE, HINGE, SCALAR
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
+from .floors import Floors, unite
 from .goals import bake
 from .mistakes import Mistake, report
 from .motion import Curves, constant_or_keyed, curves
@@ -31,7 +32,7 @@ class Setup:
 
     ``model`` has the scene's switches applied, ``as_filed`` has none of them. ``coupled`` names joints that
     follow a keyed joint through an equality of the model, ``overruled`` options of further models that
-    differ from those of the first.
+    differ from those of the first, ``floors`` planes for which others stand.
     """
 
     scene: Scene
@@ -46,6 +47,7 @@ class Setup:
     wrenches: tuple[Wrench, ...]
     state0: State
     overruled: tuple[str, ...]
+    floors: Floors
 
 
 def build(scene: Scene) -> Setup:
@@ -65,6 +67,8 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
         _compile(spec)
         name_everything(spec)
         model, overruled = _compile(spec)
+        floors = unite(spec, model, scene)
+        model = _compile(spec)[0] if floors else model
     except ValueError as e:
         return None, [*mistakes, Mistake(("models",), f"the models do not fit together: {e}")]
     mistakes += _law(scene)
@@ -76,7 +80,7 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
         mistakes += bake(scene, model, found, state0.q)
     roles, wrong = _roles(scene, model, found)
     mistakes += wrong
-    mistakes += apply_contacts(spec, model, scene)
+    mistakes += apply_contacts(spec, model, scene, floors)
     wrenches, wrong = _wrenches(scene, model)
     mistakes += wrong
     mistakes += _film_names(scene, model)
@@ -99,7 +103,19 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
         return None, wrong
     state0 = _start_on_keys(scene, model, roles, clip, state0)
     setup = Setup(
-        scene, model, as_filed, roles, clip, found, coupled, drives, servo, wrenches, state0, overruled
+        scene,
+        model,
+        as_filed,
+        roles,
+        clip,
+        found,
+        coupled,
+        drives,
+        servo,
+        wrenches,
+        state0,
+        overruled,
+        floors,
     )
     return setup, []
 
