@@ -262,8 +262,9 @@ def test_steps_that_follow_a_tolerance_see_keyed_motion_at_every_moment(method, 
     # a method of order p gains little by steps that straddle a break: they are few only when they end there
     assert path.rejected < 5 + path.evaluations / TABLEAUS[method].stages / 4
     batch = smooth.integrate(
-        np.full((5, 1), 0.2), [0.0], times, method=TABLEAUS[method], rtol=1e-11, atol=1e-11, w=keyed_by(curve)
-    )
+        np.full((5, 1), 0.2), [0.0], times, method=TABLEAUS[method], rtol=1e-11, atol=1e-11,
+        w=keyed_by(curve), breaks=breaks,
+    )  # fmt: skip
     np.testing.assert_allclose(batch.x, np.tile(path.x, (5, 1, 1)), rtol=0, atol=1e-10)
 
 
@@ -343,6 +344,10 @@ def test_prescribed_motion_becomes_polynomials_that_agree_to_rounding():
     np.testing.assert_allclose(pieces([1.5], left=True), pieces([1.5]))
     # a jump on a boundary between halves
     assert pieces_of(lambda t: np.sign(t - 1.5)[:, None], 1, 0.0, 3.0).times_of_breaks.tolist() == [1.5]
+    # a kink is a break as well, also on such a boundary
+    for kink in (1.0, 1.5):
+        bent = pieces_of(lambda t, kink=kink: np.abs(t - kink)[:, None], 1, 0.0, 3.0)
+        np.testing.assert_allclose(bent.times_of_breaks, [kink], atol=1e-10)
     with pytest.raises(EngineError, match="not finite at t = "):
         pieces_of(lambda t: np.where(t < 1, t, np.nan)[:, None], 1, 0.0, 3.0)
     with pytest.raises(EngineError, match=r"shape \(16,\)"):

@@ -313,3 +313,149 @@ def test_divergence_keeps_finite_samples(tmp_path):
     assert "'z'" in segment.message
     assert np.isfinite(segment.q).all()
     assert 0 < len(segment.t) < 500
+
+
+# ---- steps that follow a tolerance
+
+
+def adaptively(plan, tolerance, integrator="dopri5"):
+    """The scene's motion in steps that follow a tolerance."""
+    problem = dataclasses.replace(plan.problem, tolerance=tolerance, integrator=integrator)
+    return run(dataclasses.replace(plan, problem=problem))
+
+
+@pytest.mark.parametrize("integrator", ["dopri5", "dop853"])
+def test_adaptive_steps_stop_a_joint_at_its_limit_at_the_closed_form_time(tmp_path, integrator):
+    """It falls on the limit, lies there, is pushed off by 50 N/s and comes to rest on it again."""
+    keys = [
+        {
+            "actuator": "push",
+            "times": [0.0, 1.0, 1.5, 1.6, 2.4],
+            "values": [0, 0, 25, 0, 0],
+            "curve": "linear",
+        }
+    ]
+    scene = scene_of(tmp_path, SLIDE, duration=2.4, keys=keys, solver={"step": 0.001}, rate=100)
+    plan = make_plan(scene)
+    r = adaptively(plan, 1e-9, integrator)
+    kinds = [(e.kind, round(e.t, 9)) for e in r.events]
+    fall = np.sqrt(2 * 0.5 / G)
+    leave = 1.0 + 2 * G / 50
+    assert kinds[:2] == [("limit", round(fall, 9)), ("limit end", round(leave, 9))]
+    assert kinds[2][0] == "limit" and len(kinds) == 3
+    np.testing.assert_array_equal(r.t, plan.problem.step * np.arange(0, 2401, 10))
+    rest = ((r.t > fall) & (r.t < leave)) | (r.t > kinds[2][1])
+    assert np.all(r.q[rest, 0] == -0.5) and np.all(r.v[rest] == 0.0)
+    free = r.t < fall
+    np.testing.assert_allclose(r.q[free, 0], -G * r.t[free] ** 2 / 2, atol=1e-10)
+    up = (r.t > leave) & (r.t < 1.5)
+    np.testing.assert_allclose(r.q[up, 0], -0.5 + 50 * (r.t[up] - leave) ** 3 / 12, atol=1e-9)
+    assert r.stats["steps"] < 120
+
+
+def test_a_limit_that_is_passed_and_left_within_one_step_is_not_overlooked(tmp_path):
+    """A ball thrown up against a ceiling just below its apex: one step would carry it over and back."""
+    apex = 1.0 / (2 * G)
+    for depth, hits in ((1e-5, 1), (-1e-5, 0)):
+        xml = SLIDE.replace('range="-0.5 2"', f'range="-5 {apex - depth}"')
+        scene = scene_of(
+            tmp_path, xml, duration=0.25, initial={"velocity": {"z": 1.0}}, solver={"step": 0.25}, rate=4
+        )
+        plan = make_plan(scene)
+        for r in (run(plan), adaptively(plan, 1e-2), adaptively(plan, 1e-10)):
+            met = [e for e in r.events if e.kind == "limit"]
+            assert len(met) == hits
+            if hits:
+                assert abs(met[0].t - (1 / G - np.sqrt(2 * depth / G))) < 1e-8
+            else:
+                np.testing.assert_allclose(r.q[-1, 0], 0.25 - G * 0.25**2 / 2, atol=1e-9)
+
+
+@settings(max_examples=8)
+@given(problems())
+def test_adaptive_and_fixed_steps_agree_on_keyed_and_controlled_trees(case):
+    problem, force = case
+    force = np.where(problem.dofs(Role.KEYED), 0.0, force)
+    span = (0.0, problem.duration)
+    # keys at 0.07 s lie on the grid of steps, so that both methods keep their order
+    fixed = dataclasses.replace(problem, integrator="dop853", step=0.0005, sample_every=40)
+    adaptive = dataclasses.replace(problem, integrator="dop853", tolerance=1e-11)
+    ours = SmoothEngine().run(adaptive, span, Constant(force, 0))
+    theirs = SmoothEngine().run(fixed, span, Constant(force, 0))
+    assert ours.status == "done"
+    np.testing.assert_allclose(ours.t, theirs.t, atol=1e-15)
+    np.testing.assert_allclose(ours.tick_t, theirs.tick_t, atol=1e-15)
+    scale = 1 + np.abs(theirs.v).max() ** 2
+    np.testing.assert_allclose(ours.q, theirs.q, atol=1e-9 * scale)
+    np.testing.assert_allclose(ours.v, theirs.v, atol=1e-8 * scale)
+    np.testing.assert_allclose(ours.a, theirs.a, atol=1e-6 * scale)
+
+
+class Pulling:
+    """A sampled law of the state: a spring to zero, with a memory of its calls."""
+
+    def __init__(self, period):
+        self.period, self.seen = period, []
+
+    def sample(self, k, t, q, v):
+        from pantograph.sim.engines.interface import Held
+
+        self.seen.append((k, t))
+        return Held(np.zeros(0), np.array([-3.0 * q[0] - 0.2 * v[0]]))
+
+
+def test_a_controller_is_sampled_at_its_period_whatever_the_steps_are(tmp_path):
+    """m = 2 kg pushed by f held over each period: x and v follow by the closed form."""
+    xml = SLIDE.replace('range="-0.5 2" limited="true"', "").replace("0 0 -9.81", "0 0 0")
+    xml = xml.replace('<actuator><motor name="push" joint="z"/></actuator>', "")
+    scene = scene_of(tmp_path, xml, duration=1.03, initial={"position": {"z": 1.0}}, solver={"step": 0.01})
+    problem = dataclasses.replace(
+        make_plan(scene).problem, tolerance=1e-8, integrator="dopri5", sample_every=1
+    )
+    law = Pulling(0.05)
+    segment = SmoothEngine().run(problem, (0.0, 1.03), law)
+    assert law.seen == [(k, pytest.approx(0.05 * k)) for k in range(21)]
+    x, v = 1.0, 0.0
+    for t, q, speed in zip(segment.t, segment.q[:, 0], segment.v[:, 0], strict=True):
+        k = int((t + 1e-9) / 0.05)
+        x, v = 1.0, 0.0
+        for _ in range(k):
+            f = -3.0 * x - 0.2 * v
+            x, v = x + 0.05 * v + f * 0.05**2 / 4, v + f * 0.05 / 2
+        dt, f = t - 0.05 * k, -3.0 * x - 0.2 * v
+        assert q == pytest.approx(x + dt * v + f * dt * dt / 4, abs=1e-9)
+        assert speed == pytest.approx(v + f * dt / 2, abs=1e-9)
+
+
+def test_linear_keys_kick_in_adaptive_steps_too(tmp_path):
+    xml = """
+<mujoco><option timestep="0.002" gravity="0 0 -9.81"/><worldbody>
+  <body name="cart"><joint name="pivot" type="slide" axis="1 0 0"/>
+    <geom size="0.05" mass="1" contype="0" conaffinity="0"/>
+    <body name="bob"><joint name="swing" axis="0 -1 0"/>
+      <inertial pos="0 0 -1" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body>
+</worldbody></mujoco>"""
+    keys = [{"joint": "pivot", "times": [0, 0.5007, 1.5], "values": [0, 0, 0.9993], "curve": "linear"}]
+    scene = scene_of(tmp_path, xml, duration=1.0, rate=500, keys=keys, solver={"engine": "smooth"})
+    r = adaptively(make_plan(scene), 1e-10)
+    np.testing.assert_allclose(r.q[r.t < 0.5007, 1], 0.0, atol=1e-12)
+    after = r.t > 0.5007
+    kept = 0.5 * r.v[after, 1] ** 2 + G * (1 - np.cos(r.q[after, 1]))
+    np.testing.assert_allclose(kept, 0.5, atol=1e-8)
+
+
+def test_a_scene_that_no_step_is_small_enough_for_says_so(tmp_path):
+    xml = SLIDE.replace('range="-0.5 2" limited="true"', 'stiffness="-1e6"')
+    scene = scene_of(
+        tmp_path,
+        xml,
+        duration=5.0,
+        initial={"position": {"z": 0.1}},
+        solver={"engine": "smooth", "step": 0.0005},
+    )
+    problem = dataclasses.replace(make_plan(scene).problem, tolerance=1e-6, integrator="dopri5")
+    segment = SmoothEngine().run(problem, (0.0, 5.0), None)
+    assert segment.status == "diverged"
+    assert np.isfinite(segment.q).all()
+    assert 0 < len(segment.t) < 10000
+    assert "t = " in segment.message

@@ -110,11 +110,23 @@ class _Integrator:
             f"ptr %offsets, ptr {values}, ptr {rates})"
         )
 
+    def halfway(self, h: str) -> None:
+        """State and prescribed motion in the middle of a step, by the cubic through both ends."""
+        e, half = self.e, self.e.const(0.5)
+        for i in e.over(self.shape.nx):
+            mean = e.f("fmul", e.f("fadd", e.load(self.X, i), e.load(self.XN, i)), half)
+            bend = e.f("fsub", e.load(self.K[0], i), e.load(self.K[self.last], i))
+            e.store(e.f("fadd", mean, e.f("fmul", e.f("fmul", h, e.const(0.125)), bend)), self.Y, i)
+        self.prescribe(e.f("fadd", self.get("t"), e.f("fmul", h, half)))
+
     def hold_back(self, h: str, accept: str) -> str:
-        """The lanes that accept without those where a guard is below zero at the step's end, or may have
-        been in between: it fell at the start and rises at the end, near enough to zero."""
+        """The lanes that accept without those where a guard is below zero at the step's end or middle, or may
+        have been elsewhere: it fell at the start and rises at the end, near enough to zero."""
         e = self.e
         self.guard(self.XN, self.GN, self.GN_rate)
+        middle, rates = e.slot(self.guards), e.slot(self.guards)
+        self.halfway(h)
+        self.guard(self.Y, middle, rates)
         stop = e.compare("one", e.const(0.0), e.const(0.0))
         for i in range(self.guards):
             before, after = e.load(self.G, i), e.load(self.GN, i)
@@ -125,7 +137,8 @@ class _Integrator:
             )
             near = e.compare("olt", lower, e.f("fmul", h, e.f("fsub", rise, fall)))
             dipped = e.emit(f"and {e.B} {turned}, {near}")
-            for suspect in (e.compare("olt", after, e.const(0.0)), dipped):
+            below = [e.compare("olt", value, e.const(0.0)) for value in (after, e.load(middle, i))]
+            for suspect in (*below, dipped):
                 stop = e.emit(f"or {e.B} {stop}, {suspect}")
         stop = e.emit(f"and {e.B} {stop}, {accept}")
         self.set("status", e.select(stop, e.const(GUARDED), self.get("status")))
@@ -156,7 +169,7 @@ class _Integrator:
 
     def error_norm(self, h: str) -> str:
         """Root mean square error in units of the tolerance."""
-        e, count = self.e, self.e.const(1.0 / self.shape.nx)
+        e, count = self.e, self.e.const(1.0 / max(1, self.shape.nx))
         high = e.f("fmul", self.error(self.method.b_error, h), count)
         if self.method.b_error_low is None:
             return e.call("sqrt", high)

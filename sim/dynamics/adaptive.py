@@ -18,7 +18,7 @@ from .laws import LinearFeedback
 from .layout import Layout
 from .loops import Guards, Loop, compiled_loop, finish
 from .path import Path
-from .prescribed import Pieces, constant, pieces_of
+from .prescribed import Pieces, constant, ends, pieces_of
 from .rows import NO_MOTION, NOTHING, Controls, Prescribed, Start, control_rows, parameter_rows
 
 if TYPE_CHECKING:
@@ -76,10 +76,9 @@ class Spans:
     def _find(self, lay: Layout, motion: Pieces) -> None:
         """Breaks of the motion, and jumps of its velocities."""
         velocities = slice(len(lay.q_keyed), len(lay.q_keyed) + len(lay.v_keyed))
-        c = motion.coefficients
-        before, after = c[:-1, velocities].sum(axis=2), c[1:, velocities].copy()
-        after[:, :, 1::2] *= -1.0
-        change = after.sum(axis=2) - before
+        after, before = (side[:, velocities] for side in ends(motion.coefficients))
+        after, before = after[1:], before[:-1]
+        change = after - before
         sudden = (np.abs(change) > JUMP * (1.0 + np.abs(before))).any(axis=1)
         self.jumps = np.ascontiguousarray(change[sudden])
         self.times_of_jumps = motion.knots[1:-1][sudden]
@@ -183,7 +182,8 @@ def adaptive(
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Where a call of `Follower` has come to: x (nx,) at t [s], the next step `h`, records from `first` on.
+    """Where a call of `Follower` has come to: x (nx,) at t [s], the next step `h`, records from `first` on,
+    and what it took.
 
     `guarded`: it stands before a step of length `h` in which a guard may be passed.
     `failed` says why it went no further, "" if it did not fail.
@@ -195,6 +195,7 @@ class Reached:
     records: Array
     first: int
     evaluations: int
+    steps: int
     guarded: bool
     failed: str
 
@@ -215,7 +216,7 @@ class Follower:
         self._x, self._u, self._h = np.zeros(nx), np.zeros(max(1, smooth.layout.nu)), np.zeros(1)
         self._path, self._x1 = np.zeros((len(t_eval), nx)), np.zeros(nx)
         self._stats, self._tolerance = np.zeros(len(STATISTICS)), np.full(nx, tolerance)
-        self._offsets = np.zeros(guards.count if guards else 1)
+        self._offsets = np.zeros(guards.count if guards else 0)
         self._parameters = smooth.own_parameters
 
     def __call__(
@@ -226,7 +227,7 @@ class Follower:
         t1: float,
         h: float,
         *,
-        offsets: ArrayLike = 0.0,
+        offsets: ArrayLike = (),
         jump: bool = True,
     ) -> Reached:
         """From `x` (nx,) at t0 to t1 or before a guard, under held controls `u` (nu,), first step `h`.
@@ -246,10 +247,10 @@ class Follower:
             at(motion.knots), at(motion.coefficients), motion.terms, at(self.spans.jumps), at(self._offsets),
             at(self._times), last, first, at(self._path), at(self._x1), at(self._stats),
         )  # fmt: skip
-        _, _, evaluations, status, following, t = self._stats.tolist()
+        steps, _, evaluations, status, following, t = self._stats.tolist()
         end = int(np.searchsorted(self._times[:last], t, "right" if t < t1 else "left"))
         failed = "" if status in (OK, GUARDED) else STATUS[int(status)]
         return Reached(
-            self._x1.copy(), t, following, self._path[first:end].copy(), first, int(evaluations),
+            self._x1.copy(), t, following, self._path[first:end].copy(), first, int(evaluations), int(steps),
             status == GUARDED, failed,
         )  # fmt: skip

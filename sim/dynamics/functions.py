@@ -48,10 +48,14 @@ def _bias(eq: Equations, kind: str) -> Tape:
     return eq.tape("q v w p", {"bias": eq.world(local)})
 
 
-def _drive(eq: Equations, kind: str) -> Tape:
+def drive_forces(eq: Equations, kind: str, tau: Sequence[Scalar] | None = None) -> list[Scalar]:
     """Forces that the keyed freedoms' drives must give, with the others moving as they do."""
-    total = spatial.sub(eq.inverse(eq.acceleration(kind, eq.inputs["tau"])), eq.actuation[0])
-    return eq.tape(STATE, {"drive": [total[dof] for dof in eq.layout.v_keyed]})
+    total = spatial.sub(eq.inverse(eq.acceleration(kind, tau)), eq.actuation[0])
+    return [total[dof] for dof in eq.layout.v_keyed]
+
+
+def _drive(eq: Equations, kind: str) -> Tape:
+    return eq.tape(STATE, {"drive": drive_forces(eq, kind, eq.inputs["tau"])})
 
 
 def _actuation(eq: Equations, kind: str) -> Tape:

@@ -21,6 +21,10 @@ NARROWEST = 1e-12
 """Pieces are not halved below this part of the time span: what is in there is a break."""
 JUMP = 1e-9
 """Values that differ by more than this part of their column's largest jump."""
+BEND = 1e-7
+"""The same for what a piece changes by its slope; that of resolved pieces is known to 1e-10."""
+CLOSE = 1e-6
+"""Pieces shorter than this part of the time span close in on something that is not smooth."""
 MOST = 100_000
 """Pieces that are tried at most."""
 
@@ -138,11 +142,36 @@ def _joined(done: list[tuple[Array, Array, Array]], given: Array, t0: float, t1:
     coefficients[np.abs(coefficients) <= 1e-15 * np.abs(coefficients).max(axis=(0, 2), keepdims=True)] = 0.0
     used = np.flatnonzero(coefficients.any(axis=(0, 1)))
     coefficients = np.ascontiguousarray(coefficients[:, :, : used[-1] + 1 if len(used) else 1])
-    after, before = coefficients[1:, :, :].copy(), coefficients[:-1].sum(axis=2)
-    after[:, :, 1::2] *= -1.0
-    leap = np.abs(after.sum(axis=2) - before) > JUMP * np.abs(coefficients).max(axis=(0, 2))
-    broken = leap.any(axis=1) | np.isin(edges[1:-1], np.append(given, jumps))
+    broken = _leaps(coefficients, np.diff(edges)) | np.isin(edges[1:-1], np.append(given, jumps))
+    _close_in(np.diff(edges), t1 - t0, broken)
     return Pieces(edges, coefficients, np.flatnonzero(broken) + 1)
+
+
+def ends(c: Array) -> tuple[Array, Array]:
+    """Values (m, width) of polynomials (m, width, terms) at x = -1 and x = 1."""
+    signs = 1.0 - 2.0 * (np.arange(c.shape[2]) % 2)
+    return (c * signs).sum(axis=2), c.sum(axis=2)
+
+
+def _close_in(length: Array, span: float, broken: NDArray[np.bool_]) -> None:
+    """Mark the inner knots on which ever shorter pieces close in: a slope changes there, in the shortest."""
+    narrow = np.flatnonzero(length < CLOSE * span)
+    for group in np.split(narrow, np.flatnonzero(np.diff(narrow) > 1) + 1) if len(narrow) else ():
+        knot = int(group[int(np.argmin(length[group]))])  # inner knot k lies between the pieces k and k + 1
+        if 0 < knot <= len(broken) and not broken[max(0, group[0] - 1) : group[-1] + 1].any():
+            broken[knot - 1] = True
+
+
+def _leaps(c: Array, length: Array) -> NDArray[np.bool_]:
+    """Whether values or slopes differ between the two sides of each inner knot."""
+    largest = np.abs(c).max(axis=(0, 2))
+    low, high = ends(c)
+    leap = np.abs(low[1:] - high[:-1]) > JUMP * largest
+    slope = 2.0 * chebyshev.chebder(c, axis=2) / length[:, None, None]
+    low, high = ends(slope)
+    shorter = np.minimum(length[1:], length[:-1])[:, None]
+    bend = np.abs(low[1:] - high[:-1]) * shorter > BEND * largest
+    return np.asarray((leap | bend).any(axis=1))
 
 
 def _held(c: Array, x: float) -> Array:

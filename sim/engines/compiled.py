@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .interface import Array, Held, Problem, Role
-from .limits import Limit
+from .limits import Limit, Limits
 from .timed import Timed
 
 if TYPE_CHECKING:
+    from ..dynamics.loops import Guards
+    from ..dynamics.prescribed import Pieces
     from ..integrate import Tableau
 
 CHUNK = 512  # steps computed in one call at most, and steps whose prescribed motion is evaluated at once
@@ -53,6 +55,17 @@ class Compiled:
         self.timed_v = np.isin(self.v_keyed, timed.keyed)
         self.grid: tuple[int, Array] = (-1, np.zeros((0, self.nw)))
 
+    def gather(self, q: Array, v: Array, act: Array) -> Array:
+        """The compiled model's state (nx,) of the whole model's."""
+        return np.concatenate([q[self.q_free], v[self.v_free], act])
+
+    def spread(self, x: Array, w: Array) -> tuple[Array, Array, Array]:
+        """The whole model's q, v, act of the compiled model's state and a prescribed row."""
+        q, v = np.empty(self.nq + len(self.q_keyed)), np.empty(self.nv + len(self.v_keyed))
+        q[self.q_free], v[self.v_free] = x[: self.nq], x[self.nq : self.nq + self.nv]
+        q[self.q_keyed], v[self.v_keyed] = (part[0] for part in self.motion(w[None]))
+        return q, v, x[self.nq + self.nv :].copy()
+
     def held(self, held: Held) -> Array:
         """Held controls and joint forces as the compiled model takes them."""
         return np.concatenate([held.ctrl[self.u_held], held.qfrc[self.v_free]])
@@ -81,11 +94,59 @@ class Compiled:
         rows = self.stepper.rows
         return self.grid[1][(k - first) * rows : (k - first + n) * rows]
 
-    def end(self, offset: float, on_grid: bool, k: int) -> Array:
-        """The prescribed row (1, nw) at one time."""
-        if on_grid and self.grid[0] <= k < self.grid[0] + 2 * CHUNK and self.grid[0] >= 0:
+    def end(self, k: int) -> Array:
+        """The prescribed row (1, nw) where step ``k`` of the run begins."""
+        if 0 <= self.grid[0] <= k < self.grid[0] + 2 * CHUNK:
             return np.asarray(self.grid[1][(k - self.grid[0]) * self.stepper.rows][None])
-        return self._rows(np.array([offset]), left=False)
+        return self._rows(np.array([k * self.h]), left=False)
+
+    def polynomials(self, end: float) -> Pieces:
+        """The prescribed motion as polynomials in time since the run's start, up to ``end``."""
+        from ..dynamics.adaptive import motion_of
+
+        breaks = self.timed.breaks(self.t0, self.t0 + end) - self.t0
+        return motion_of(self.smooth, self.at if self.nw else None, 0.0, end, breaks)
+
+    def guards(self, limits: Limits) -> Guards | None:
+        """What steps of any length must not pass unseen: limits of free joints, the pull of those at rest."""
+        from ..dynamics.loops import Guards
+
+        free = self._free(limits)
+        gaps = [(limit, self.q_free == limit.qpos, self.v_free == limit.dof) for limit in free]
+        count = len(gaps) + len(self.resting)
+        if not count:
+            return None
+
+        def tape() -> Tape:
+            eq = self.smooth.equations
+            q, v, offsets = eq.inputs["q"], eq.inputs["v"], eq.graph.inputs("offsets", count)
+            places = [(limit, int(np.argmax(at_q)), int(np.argmax(at_v))) for limit, at_q, at_v in gaps]
+            values = [limit.side * (limit.bound - q[i]) for limit, i, _ in places]
+            rates = [-limit.side * v[j] for limit, _, j in places]
+            forces = drive_forces(eq, self.smooth.formulation)
+            values += [
+                -limit.side * forces[int(np.argmax(self.v_keyed == limit.dof))] for limit in self.resting
+            ]
+            rates += [0.0] * len(self.resting)
+            given = {name: len(eq.inputs[name]) for name in ("q", "v", "act", "u", "w", "p")}
+            values = [x + more for x, more in zip(values, offsets, strict=True)]
+            return Tape.build(given | {"offsets": count}, {"values": values, "rates": rates})
+
+        from ..compile.tape import Tape
+        from ..dynamics.functions import drive_forces
+
+        sides = [(limit.joint, limit.bound, limit.side) for limit in (*free, *self.resting)]
+        return Guards(repr((sides, len(self.resting))), count, tape)
+
+    def guard_offsets(self, held: Held, limits: Limits) -> Array:
+        """What is added to the guards under held inputs: a controller's forces on joints at rest."""
+        free = np.zeros(len(self._free(limits)))
+        return np.concatenate([free, [limit.side * held.qfrc[limit.dof] for limit in self.resting]])
+
+    def _free(self, limits: Limits) -> list[Limit]:
+        """Limits of the joints that do not rest."""
+        still = {limit.joint for limit in self.resting}
+        return [limit for limit in limits.each if limit.joint not in still]
 
     def prescribed(self, starts: NDArray[np.floating], step: float) -> Array:
         """Rows (n * stages, nw) for steps that begin ``starts`` (n,) seconds after the run's start, stage by

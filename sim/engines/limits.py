@@ -7,6 +7,7 @@ from functools import cached_property
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kinds import SCALAR
 from .interface import Array, Problem, Role
@@ -43,22 +44,35 @@ class Limits:
         qpos, bound, side = self._arrays
         return np.asarray(side * (bound - q[:, qpos]))
 
-    def passed(self, q: Array, resting: tuple[Limit, ...]) -> list[Limit]:
-        """Limits that state q (nq,) has passed, those on which joints rest aside."""
+    def suspect(self, q: Array, v: Array, step: float) -> NDArray[np.bool_]:
+        """Whether each limit (n, limits) is passed, or may be, in the n steps between states q (n + 1, nq).
+
+        It may when the joint came nearer at the step's start, goes away at its end, and is near enough.
+        """
+        _, _, side = self._arrays
+        gap, closing = self.gaps(q), side * v[:, [limit.dof for limit in self.each]]
+        turned = (closing[:-1] > 0) & (closing[1:] < 0)
+        near = np.minimum(gap[:-1], gap[1:]) < step * (closing[:-1] - closing[1:])
+        return np.asarray((gap[1:] < 0) | (turned & near))
+
+    def near(
+        self, q0: Array, v0: Array, q1: Array, v1: Array, step: float, resting: tuple[Limit, ...]
+    ) -> list[Limit]:
+        """Limits that a step from (q0, v0) to (q1, v1) passes or may pass, those of joints at rest aside."""
         if not self.each:
             return []
-        found = np.flatnonzero(self.gaps(q[None])[0] < 0)
-        return [self.each[i] for i in found if self.each[i] not in resting]
+        still = {limit.joint for limit in resting}
+        found = np.flatnonzero(self.suspect(np.stack([q0, q1]), np.stack([v0, v1]), step)[0])
+        return [self.each[i] for i in found if self.each[i].joint not in still]
 
-    def first_passed(self, q: Array, resting: tuple[Limit, ...]) -> int | None:
-        """Index of the first of states q (n, nq) that has passed a limit; None when none has."""
+    def doubtful(self, q: Array, v: Array, step: float, resting: tuple[Limit, ...]) -> NDArray[np.bool_]:
+        """Whether each of n steps between states q (n + 1, nq) passes a limit, or may."""
         if not self.each:
-            return None
-        beyond = self.gaps(q) < 0
-        if resting:
-            beyond[:, [self.each.index(limit) for limit in resting]] = False
-        found = np.flatnonzero(beyond.any(axis=1))
-        return int(found[0]) if len(found) else None
+            return np.zeros(len(q) - 1, dtype=bool)
+        found = self.suspect(q, v, step)
+        still = {limit.joint for limit in resting}
+        found[:, [i for i, limit in enumerate(self.each) if limit.joint in still]] = False
+        return np.asarray(found.any(axis=1))
 
 
 def limits_of(problem: Problem) -> Limits:

@@ -64,6 +64,14 @@ class Timed:
                 found[k] = found.get(k, 0.0) + jump
         return found
 
+    def breaks(self, t0: float, t1: float) -> Array:
+        """Times strictly between ``t0`` and ``t1`` where a keyed motion or a wrench is known to bend."""
+        found = [self.clip.breaks_between(t0, t1)]
+        for w in self.problem.wrenches:
+            found += [curve.breaks_between(t0, t1) for curve in (w.force, w.torque) if curve is not None]
+            found.append(np.array([t for t in (w.start, w.stop) if t0 < t < t1]))
+        return np.unique(np.concatenate(found))
+
     def at(self, t: NDArray[np.floating], *, left: bool = False) -> TimedInputs:
         """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
         times: Array = np.asarray(t, dtype=np.float64)
@@ -74,14 +82,15 @@ class Timed:
             q, v, a = motion.q[:, self.qpos], motion.v[:, self.keyed], motion.a[:, self.keyed]
         ctrl = np.zeros((n, len(self.servos)))
         for i, actuator in enumerate(self.servos):
-            ctrl[:, i] = self.problem.servo[int(actuator)](times)
+            # the limit from the left, up to what a servo's command changes in the shortest time that counts
+            early = 1e-13 * np.maximum(1.0, np.abs(times)) if left else 0.0
+            ctrl[:, i] = self.problem.servo[int(actuator)](times - early)
         wrench = np.zeros((n, len(self.bodies), 6))
         for i, w in enumerate(self.problem.wrenches):
-            on = ((times >= w.start) & (times < w.stop))[:, None]
-            if w.force is not None:
-                wrench[:, i, :3] = np.where(on, w.force(times).q, 0.0)
-            if w.torque is not None:
-                wrench[:, i, 3:] = np.where(on, w.torque(times).q, 0.0)
+            begun, ended = (times > w.start, times > w.stop) if left else (times >= w.start, times >= w.stop)
+            for curve, part in ((w.force, slice(0, 3)), (w.torque, slice(3, 6))):
+                if curve is not None:
+                    wrench[:, i, part] = np.where((begun & ~ended)[:, None], curve(times, left=left).q, 0.0)
         return TimedInputs(q, v, a, ctrl, wrench)
 
 

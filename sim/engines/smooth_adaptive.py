@@ -1,0 +1,118 @@
+"""The smooth engine in steps that follow a tolerance: compiled from sample to sample, up to what happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import EngineError
+from .interface import Array, Controls, Problem
+from .smooth_run import Run
+
+if TYPE_CHECKING:
+    from ..dynamics.adaptive import Follower
+    from ..integrate import Tableau
+
+MOST = 1000
+"""Events without time between them."""
+
+
+class AdaptiveRun(Run):
+    """A run to the problem's tolerance: relative, and absolute in SI units."""
+
+    def __init__(
+        self, problem: Problem, t_span: tuple[float, float], controls: Controls | None, method: Tableau
+    ) -> None:
+        super().__init__(problem, t_span, controls, method)
+        at = np.unique(np.append(np.arange(0, self.steps, problem.sample_every), self.steps))
+        self.records = at * self.h
+        self.end = self.steps * self.h
+        self.next_step = 1e-3 * min(self.end, controls.period if controls else self.end)
+        self.followers: dict[int, Follower] = {}
+        self.jumped = False  # at the current moment
+
+    def advance(self, progress: Callable[[float], None] | None) -> str:
+        """See `Run`."""
+        period = self.controls.period if self.controls else self.end
+        ticks = max(1, int(np.ceil(self.end / period - 1e-9)))
+        for k in range(ticks):
+            if self.controls:
+                self.sample(k)
+            if message := self._until(min(self.end, (k + 1) * period), progress):
+                return message
+        self.keep(self.offset, self.q, self.v, self.act)
+        return self.nonsense()
+
+    def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
+        """Record a state; of several at one moment the last."""
+        if self.samples and self.samples[-1][0] == self.t0 + offset:
+            del self.samples[-1], self.rests[-1]
+        super().keep(offset, q, v, act)
+
+    def _until(self, stop: float, progress: Callable[[float], None] | None) -> str:
+        """Go on to the offset ``stop``, from event to event."""
+        self.release()
+        at_once = 0
+        while self.offset < stop:
+            c, begun = self.model(), self.offset
+            reached = self._follower()(
+                c.gather(self.q, self.v, self.act), c.held(self.held), begun, stop, self.next_step,
+                offsets=c.guard_offsets(self.held, self.limits), jump=not self.jumped,
+            )  # fmt: skip
+            self.evaluations += reached.evaluations
+            self.done += reached.steps
+            for t, x in zip(self.records[reached.first :], reached.records, strict=False):
+                self.keep(float(t), *c.spread(x, c.at(np.array([t]))[0]))
+            self.offset, self.next_step = reached.t, reached.h
+            self.jumped = reached.t == begun or reached.t < stop
+            self.q, self.v, self.act = c.spread(reached.x, c.at(np.array([reached.t]))[0])
+            if reached.failed:
+                return f"{reached.failed} at t = {self.now:.4g} s: {self.nonsense() or self._advice()}"
+            if reached.guarded:
+                self._step(min(reached.h, stop - self.offset))
+            at_once = at_once + 1 if self.offset == begun else 0
+            if at_once > MOST:
+                raise EngineError(f"joints meet and leave their limits without end at t = {self.now:.6g} s")
+            if progress:
+                progress(self.now)
+        return ""
+
+    def _step(self, length: float) -> None:
+        """One step of ``length`` seconds, or as much of it as comes before an event, and the event."""
+        moment = self.first_event(length)
+        share = 1.0 if moment is None else moment.share
+        end = self.offset + share * length
+        for t in self.records[(self.records > self.offset) & (self.records < end)]:
+            self.keep(float(t), *self.roll(float(t) - self.offset))
+        self.move(share, length)
+        self.jumped = self.jumped and share == 0.0
+        if moment is not None:
+            self.happen(moment)
+
+    def _follower(self) -> Follower:
+        """The compiled integration with the joints at rest taken out."""
+        from ..dynamics.adaptive import Follower
+
+        c = self.model()
+        if id(c) not in self.followers:
+            tolerance = self.problem.tolerance
+            assert tolerance is not None
+            motion = c.polynomials(self.end)
+            self.followers[id(c)] = Follower(
+                c.smooth, self.method, motion, self.records, tolerance, c.guards(self.limits)
+            )
+        return self.followers[id(c)]
+
+    @property
+    def pace(self) -> str:
+        """See `Run`."""
+        return f"a tolerance of {self.problem.tolerance:g}"
+
+    def _advice(self) -> str:
+        return "the motion is too stiff or too wild for this tolerance; try a larger one, or fixed steps"
+
+    def facts(self) -> dict[str, Any]:
+        """See `Run`."""
+        return {"step": None, "tolerance": self.problem.tolerance}

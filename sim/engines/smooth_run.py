@@ -1,0 +1,300 @@
+"""What runs of the smooth engine share: their state, impacts at limits, and the segment they become."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ...models import name_of
+from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
+from .compiled import Compiled
+from .interface import Array, Controls, Event, Held, Problem, Segment, State
+from .limits import Limit, limits_of
+from .smooth import RESTITUTION, friction_width, mobility
+from .timed import Timed
+
+if TYPE_CHECKING:
+    from ..integrate import Tableau
+
+NARROW = 1e-12
+"""Moments of events are known to this share of their step."""
+
+
+class Moment(NamedTuple):
+    """The first event within a step: the share of the step before it, the limit, and whether it is met."""
+
+    share: float
+    limit: Limit
+    met: bool
+
+
+class Run:
+    """State of one run: the whole model's q, v, act at `offset` seconds after its start."""
+
+    def __init__(
+        self, problem: Problem, t_span: tuple[float, float], controls: Controls | None, method: Tableau
+    ) -> None:
+        self.problem, self.controls, self.method, self.t0 = problem, controls, method, t_span[0]
+        self.h = problem.step
+        self.steps = round((t_span[1] - t_span[0]) / self.h)
+        self.timed, self.limits = Timed(problem), limits_of(problem)
+        self.resting: tuple[Limit, ...] = ()
+        self.compiled: dict[tuple[Limit, ...], Compiled] = {}
+        self.offset = 0.0
+        self.q, self.v, self.act = (np.array(x, dtype=float) for x in problem.state0)
+        self.held = Held(np.zeros(problem.model.nu), np.zeros(problem.model.nv))
+        self.samples: list[tuple[float, State]] = []
+        self.rests: list[tuple[Limit, ...]] = []
+        self.ticks: list[tuple[float, Held]] = []
+        self.events: list[Event] = []
+        self.evaluations = 0
+        self.build_s = 0.0
+        self.done = 0  # steps
+
+    def segment(self, progress: Callable[[float], None] | None) -> Segment:
+        """Run to the end, or as far as it goes."""
+        started, status, message, failure = time.perf_counter(), "done", "", None
+        try:
+            message = self.advance(progress)
+            status = "diverged" if message else "done"
+        except KeyboardInterrupt:
+            status, message = "interrupted", f"interrupted at t = {self.now:.4g} s"
+        except Exception as error:
+            status, failure = "failed", error
+            message = f"failed at t = {self.now:.4g} s: {place_of(error)}"
+        segment = self.result(status, message, time.perf_counter() - started)
+        if failure is not None:
+            raise Broken(segment) from failure
+        return segment
+
+    def advance(self, progress: Callable[[float], None] | None) -> str:
+        """Move the state to the end, keeping samples; why the state makes no sense, or an empty string."""
+        raise NotImplementedError
+
+    @property
+    def now(self) -> float:
+        """Time of the state [s]."""
+        return self.t0 + self.offset
+
+    @cached_property
+    def width(self) -> float | None:
+        """Speed below which dry friction is smoothed."""
+        return friction_width(self.problem.model, mobility(self.problem), self.h)
+
+    def model(self) -> Compiled:
+        """The compiled model, with the joints that rest at a limit taken out of the unknowns."""
+        if self.resting not in self.compiled:
+            begun = time.perf_counter()
+            self.compiled[self.resting] = Compiled(
+                self.problem, self.timed, self.t0, self.method, width=self.width, resting=self.resting
+            )
+            self.build_s += time.perf_counter() - begun
+        return self.compiled[self.resting]
+
+    def sample(self, k: int) -> None:
+        """Sample the controller at its tick ``k``."""
+        assert self.controls is not None
+        self.held = self.controls.sample(k, self.now, self.q.copy(), self.v.copy())
+        self.ticks.append((self.now, self.held))
+
+    def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
+        """Record a state."""
+        self.samples.append((self.t0 + offset, State(q.copy(), v.copy(), act.copy())))
+        self.rests.append(self.resting)
+
+    def roll(self, length: float) -> tuple[Array, Array, Array]:
+        """The state one step of ``length`` seconds later."""
+        c = self.model()
+        w = c.prescribed(np.array([self.offset]), length)
+        x = c.stepper(c.gather(self.q, self.v, self.act), c.held(self.held), 1, length, w)
+        self.evaluations += c.stepper.stages
+        return c.spread(x[-1], c.at(np.array([self.offset + length]))[0])
+
+    def first_event(self, length: float) -> Moment | None:
+        """What happens first within one step of ``length`` seconds from here."""
+        q, v, act = self.roll(length)
+        found: list[Moment] = []
+        for limit in self.limits.near(self.q, self.v, q, v, length, self.resting):
+            share = self._meeting(limit, q, v, length)
+            if share is not None:
+                found.append(Moment(share, limit, True))
+        for share in (0.5, 1.0) if self.resting else ():
+            state = (q, v, act) if share == 1.0 else self.roll(share * length)
+            for i in np.flatnonzero(self.limit_forces(self.offset + share * length, *state) < 0):
+                found.append(Moment(self._leaving(int(i), share, length), self.resting[i], False))
+        return min(found, key=lambda moment: moment.share, default=None)
+
+    def _meeting(self, limit: Limit, q: Array, v: Array, length: float) -> float | None:
+        """Share of the step at which a gap closes, to rounding; None if it stays open."""
+        from scipy.optimize import brentq
+
+        def gap(share: float) -> float:
+            return limit.gap(self.roll(share * length)[0]) if share > 0.0 else limit.gap(self.q)
+
+        def closing(share: float) -> float:
+            return limit.side * float(
+                self.roll(share * length)[1][limit.dof] if share > 0.0 else self.v[limit.dof]
+            )
+
+        last = 1.0
+        if limit.gap(q) >= 0.0:  # it may have closed and opened again: look where it is smallest
+            last = float(brentq(closing, 0.0, 1.0, xtol=1e-9))
+            if gap(last) >= 0.0:
+                return None
+        return 0.0 if gap(0.0) <= 0.0 else float(brentq(gap, 0.0, last, xtol=NARROW))
+
+    def _leaving(self, i: int, last: float, length: float) -> float:
+        """Share of the step at which the limit begins to pull the joint on it, as it does at the ``last``."""
+        from scipy.optimize import brentq
+
+        def force(share: float) -> float:
+            state = self.roll(share * length) if share > 0.0 else (self.q, self.v, self.act)
+            return float(self.limit_forces(self.offset + share * length, *state)[i])
+
+        if force(0.0) <= 0.0:
+            return 0.0
+        root = float(brentq(force, 0.0, last, xtol=NARROW))
+        # on the side where it pulls, so that the joint is let go
+        after = min(last, root + 4 * NARROW)
+        return after if force(after) < 0.0 else last
+
+    def move(self, share: float, length: float) -> None:
+        """Go on by a ``share`` of a step."""
+        if share > 0.0:
+            self.q, self.v, self.act = self.roll(share * length)
+            self.offset += share * length
+
+    def happen(self, moment: Moment) -> None:
+        """The event at the current state."""
+        if moment.met:
+            self._impact(moment.limit)
+        self.release()
+
+    def limit_forces(self, offset: float, q: Array, v: Array, act: Array) -> Array:
+        """Forces (resting,) that the limits give, positive away from them."""
+        return np.asarray(self.forces_at(np.array([offset]), q[None], v[None], act[None])[0])
+
+    def forces_at(self, offsets: Array, q: Array, v: Array, act: Array) -> Array:
+        """Forces (n, resting) that the limits give at n states."""
+        c = self.model()
+        drive = c.smooth.drive(q[:, c.q_free], v[:, c.v_free], c.held(self.held), act=act, w=c.at(offsets))
+        at = [int(np.flatnonzero(c.v_keyed == limit.dof)[0]) for limit in self.resting]
+        return np.asarray(self.sides * (self.pushed - drive[:, at]))
+
+    @property
+    def sides(self) -> Array:
+        """Directions (resting,) in which joints may not go on."""
+        return np.array([limit.side for limit in self.resting], dtype=float)
+
+    @property
+    def pushed(self) -> Array:
+        """Held forces (resting,) on the joints at rest."""
+        return np.array([self.held.qfrc[limit.dof] for limit in self.resting])
+
+    def release(self) -> None:
+        """Let joints go that their limits would have to pull; the one pulled most first."""
+        while self.resting:
+            forces = self.limit_forces(self.offset, self.q, self.v, self.act)
+            worst = int(np.argmin(forces))
+            if forces[worst] >= 0:
+                return
+            gone = self.resting[worst]
+            self.resting = tuple(limit for limit in self.resting if limit is not gone)
+            self._note("limit end", gone)
+
+    def _impact(self, limit: Limit) -> None:
+        """Impulse on the joint: its velocity becomes -RESTITUTION times what it was; with none it rests.
+
+        v+ = v - (1 + e) M^-1 J' (J M^-1 J')^-1 J v (R. Featherstone, Rigid Body Dynamics Algorithms, 11.7),
+        over the freedoms that are neither keyed nor at rest.
+        """
+        c = self.model()
+        w = np.zeros(c.nw)
+        w[: len(c.q_keyed)] = self.q[c.q_keyed]
+        M = c.smooth.mass_matrix(self.q[c.q_free], w=w)
+        j = (c.v_free == limit.dof).astype(float)
+        response = np.linalg.solve(M, j)
+        self.v[c.v_free] -= (1.0 + RESTITUTION) * self.v[limit.dof] / (j @ response) * response
+        self.q[limit.qpos] = limit.bound
+        if RESTITUTION == 0.0:
+            self.v[limit.dof] = 0.0
+            self.resting = (*self.resting, limit)
+        self._note("limit", limit)
+
+    def _note(self, kind: str, limit: Limit) -> None:
+        self.events.append(Event(self.now, kind, name_of(self.problem.model, "joint", limit.joint)))
+
+    def nonsense(self) -> str:
+        """Why the state makes no sense, or an empty string."""
+        joint = fastest_joint(self.problem.model, self.q, self.v)
+        if joint is None:
+            return ""
+        return (
+            f"diverged before t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
+            f"{self.pace} the motion is too fast or too stiff; try a smaller step, or check forces and "
+            "initial state"
+        )
+
+    @property
+    def pace(self) -> str:
+        """What sets the steps, in words."""
+        return f"a step of {self.h:g} s"
+
+    def _accelerations(self, kept: list[tuple[float, State]]) -> tuple[Array, Array]:
+        """Accelerations and forces of the drives (n, nv) at the samples, those at rest apart."""
+        n, m = len(kept), self.problem.model
+        a, drive = np.zeros((n, m.nv)), np.zeros((n, m.nv))
+        t = np.array([t for t, _ in kept])
+        tick = np.searchsorted([tick for tick, _ in self.ticks], t + 1e-9, side="right") - 1
+        nothing = Held(np.zeros(m.nu), np.zeros(m.nv))
+        for resting in dict.fromkeys(self.rests[:n]):
+            at = np.array([i for i in range(n) if self.rests[i] == resting])
+            c = self.compiled[resting]
+            q, v = (rows([getattr(kept[i][1], x) for i in at], w) for x, w in (("q", m.nq), ("v", m.nv)))
+            act = rows([kept[i][1].act for i in at], m.na)
+            u = np.array([c.held(self.ticks[tick[i]][1] if tick[i] >= 0 else nothing) for i in at])
+            w = c.at(t[at] - self.t0)
+            state = {"q": q[:, c.q_free], "v": v[:, c.v_free], "act": act, "u": u, "w": w}
+            a[np.ix_(at, c.v_free)] = c.smooth.evaluate("forward", **state)["a"]
+            if len(c.v_keyed):
+                a[np.ix_(at, c.v_keyed)] = c.accelerations(w)
+                drive[np.ix_(at, c.v_keyed)] = c.smooth.evaluate("drive", **state)["drive"]
+                drive[np.ix_(at, np.array([limit.dof for limit in resting], dtype=int))] = 0.0
+        return a, drive
+
+    def facts(self) -> dict[str, Any]:
+        """Statistics of this kind of run."""
+        return {}
+
+    def result(self, status: str, message: str, wall: float) -> Segment:
+        """The segment of what was computed."""
+        kept = [
+            (t, s) for t, s in self.samples if np.isfinite(s.q).all() and np.abs(s.v).max(initial=0) < HUGE
+        ]
+        a, drive = self._accelerations(kept)
+        builds = [c.smooth.stats for c in self.compiled.values()]
+        stats = {
+            "engine": "smooth",
+            "integrator": self.problem.integrator,
+            "step": self.h,
+            "steps": self.done,
+            "evaluations": self.evaluations,
+            "wall_s": wall - self.build_s,
+            "build_s": self.build_s,
+            "build_cached": all(b.cached for b in builds),
+            "friction_width": self.width,
+            "restitution": RESTITUTION if self.limits.each else None,
+        }
+        return Segment(
+            **recorded(self.problem.model, kept, self.ticks),
+            status=status,
+            message=message,
+            stats=stats | self.facts(),
+            events=tuple(self.events),
+            a=a,
+            drive=drive,
+        )
