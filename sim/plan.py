@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from .engines.smooth import adaptive_methods
 from .engines.smooth import methods as smooth_methods
 from .engines.touch import can_touch
 from .errors import SceneError, unknown
-from .scene.build import Setup, build, resolve
+from .scene.build import Setup, resolve
 from .scene.mistakes import Mistake, SceneMistakes, report
 from .scene.schema import Scene
 
@@ -57,21 +58,28 @@ class Plan:
         return tuple(name_of(m, "actuator", int(i)) for i in np.flatnonzero(self.problem.drives == drive))
 
 
-def make_plan(scene: Scene) -> Plan:
-    """Work out what a scene needs. Raises SceneError with every mistake of the scene."""
-    return plan_setup(build(scene))
+def make_plan(scene: Scene | str | Path) -> Plan:
+    """Work out what a scene, or the scene in a file, needs. Raises SceneError with every mistake of it."""
+    if isinstance(scene, str | Path):
+        from .scene.load import read  # which needs the plan to know all mistakes
+
+        return read(scene)[1]
+    plan, mistakes = try_plan(scene)
+    if plan is None:
+        raise report(mistakes, scene._file, scene._lines)
+    return plan
 
 
-def check(scene: Scene) -> list[Mistake]:
-    """All mistakes of a well-formed scene: those that need its models to be seen, and those of its plan."""
+def try_plan(scene: Scene) -> tuple[Plan | None, list[Mistake]]:
+    """The plan of a well-formed scene, or all its mistakes: those that need its models to be seen, and those
+    of its plan."""
     setup, mistakes = resolve(scene)
     if setup is None:
-        return mistakes + _solver(scene)
+        return None, mistakes + _solver(scene)
     try:
-        plan_setup(setup)
+        return plan_setup(setup), []
     except SceneMistakes as e:
-        return list(e.mistakes)
-    return []
+        return None, list(e.mistakes)
 
 
 def plan_setup(setup: Setup) -> Plan:

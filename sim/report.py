@@ -254,10 +254,7 @@ def hard_suite(
 
 def _plan(subject: Scene | Plan | str | Path) -> Plan:
     from .plan import Plan, make_plan
-    from .scene.load import load_scene
 
-    if isinstance(subject, str | Path):
-        subject = load_scene(subject)
     return subject if isinstance(subject, Plan) else make_plan(subject)
 
 

@@ -21,7 +21,6 @@ from .errors import EngineError, RunError
 from .plan import Plan, make_plan
 from .recording import Recording, model_to_bytes
 from .scene.build import Setup
-from .scene.load import load_scene
 from .scene.schema import Scene
 
 _UNCHECKED = "not searched for overlaps and crossed limits: interrupted"
@@ -40,8 +39,6 @@ def run(
     Raises SceneError for a scene with mistakes, EngineError for what the engine cannot do, and RunError, with
     what it has, when the controller or the engine fails on the way.
     """
-    if isinstance(scene, str | Path):
-        scene = load_scene(scene)
     plan = scene if isinstance(scene, Plan) else make_plan(scene)
     problem = plan.problem
     engine = make_engine(plan.engine.what)

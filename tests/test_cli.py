@@ -177,7 +177,7 @@ def test_notes_of_what_was_crossed_are_printed(pantograph, folder):
 def test_plan_explains_without_running(pantograph, folder):
     code, out, err = pantograph("plan", "swing.toml")
     assert (code, err) == (0, "")
-    plan = make_plan(load_scene("swing.toml"))
+    plan = make_plan("swing.toml")
     assert re.search(r"passive joints *│ hinge", out)
     said = re.sub(r"[│\s]+", " ", out)  # a narrow terminal breaks the lines of the table
     for choice in (plan.engine, plan.integrator, plan.step):
@@ -268,7 +268,7 @@ def test_example_scenes_are_right(path):
     robots = {m["file"] for m in tomllib.loads(path.read_text())["models"] if "file" in m} - set(names())
     if missing := robots - set(data_robots()):
         pytest.skip(f"needs {', '.join(missing)} in the data folder: PANTOGRAPH_DATA")
-    assert make_plan(load_scene(path)).problem.steps > 0
+    assert make_plan(path).problem.steps > 0
 
 
 def test_help_is_help(pantograph):

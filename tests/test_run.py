@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pantograph.sim import EngineError, RunError, Scene, load, make_plan, run
+from pantograph.sim import EngineError, RunError, Scene, load, load_scene, make_plan, run
 from scenes import numbers, scenes
 
 FALL = {"duration": 2.0, "models": [{"file": "double_pendulum"}], "initial": {"position": {"shoulder": 2.0}}}
@@ -34,6 +34,19 @@ def test_a_scene_its_plan_and_its_file_run_alike(tmp_path):
         np.testing.assert_array_equal(r.q, runs[0].q)
         assert r.status == "done"
         assert Scene(**r.scene) == scene
+
+
+def test_a_file_is_resolved_once(tmp_path, monkeypatch):
+    from pantograph.sim.scene import build
+
+    path = tmp_path / "scene.toml"
+    path.write_text('duration = 0.1\n[[models]]\nfile = "pendulum"\n')
+    calls, real = [], build.assemble
+    monkeypatch.setattr(build, "assemble", lambda scene: calls.append(scene) or real(scene))
+    run(path)
+    make_plan(path)
+    load_scene(path)
+    assert len(calls) == 3
 
 
 @given(scenes())

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.plan import Plan, make_plan
-from ...sim.scene.load import load_scene
 from ...sim.scene.schema import Scene
 from ..errors import HardwareError
 from ..mapping import Mapping, indices
@@ -41,8 +40,6 @@ class Live:
     def __init__(
         self, scene: Scene | Plan | str | Path, rig: Rig, mapping: Mapping, *, patient: bool
     ) -> None:
-        if isinstance(scene, str | Path):
-            scene = load_scene(scene)
         plan = scene if isinstance(scene, Plan) else make_plan(scene)
         self.model: mujoco.MjModel = plan.problem.model
         self.duration = plan.problem.steps * plan.problem.step

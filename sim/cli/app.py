@@ -80,9 +80,8 @@ def run(
     """Run a scene; its recording is always saved."""
     from ..plan import make_plan
     from ..run import run as run_scene
-    from ..scene.load import load_scene
 
-    plan = make_plan(load_scene(scene))
+    plan = make_plan(scene)
     options: dict[str, Any] = {"port": port, "stop": stop, "take_over": take_over}
     rig_motion = out / f"{scene.stem}-rig.npz"
     if live:
@@ -110,9 +109,8 @@ def run(
 def plan(scene: SceneFile) -> None:
     """Explain how a scene will be computed, what is left out, and what would be cheaper."""
     from ..plan import make_plan
-    from ..scene.load import load_scene
 
-    show.plan(console, make_plan(load_scene(scene)))
+    show.plan(console, make_plan(scene))
 
 
 @app.command(epilog="Example: pantograph film out/wave.npz wave.gif --camera side")

@@ -20,7 +20,7 @@ from ..kinds import BALL, FREE, HINGE, SCALAR
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
 from .floors import Floors, unite
 from .goals import bake
-from .mistakes import Mistake, report
+from .mistakes import Mistake
 from .motion import Curves, constant_or_keyed, curves
 from .names import Names
 from .schema import Scene
@@ -48,14 +48,6 @@ class Setup:
     state0: State
     overruled: tuple[str, ...]
     floors: Floors
-
-
-def build(scene: Scene) -> Setup:
-    """Resolve a scene. Raises SceneError with all its mistakes."""
-    setup, mistakes = resolve(scene)
-    if mistakes or setup is None:
-        raise report(mistakes, scene._file, scene._lines)
-    return setup
 
 
 def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:

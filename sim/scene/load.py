@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SceneError
-from ..plan import check
+from ..plan import Plan, try_plan
 from .mistakes import Mistake, Path_, SceneMistakes, report
 from .schema import Scene
 
@@ -25,6 +25,11 @@ def load_scene(path: str | Path) -> Scene:
     Names of joints and files are checked too, so that one report lists all mistakes.
     Raises SceneError with every mistake, its line and what would be right.
     """
+    return read(path)[0]
+
+
+def read(path: str | Path) -> tuple[Scene, Plan]:
+    """The scene in a file, and its plan, which the search for mistakes has to make anyway; see load_scene."""
     path = Path(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -38,21 +43,27 @@ def load_scene(path: str | Path) -> Scene:
         raise SceneError(f"{path} is not UTF-8 text (byte {e.start}); scenes are TOML files") from None
     except OSError as e:
         raise SceneError(f"cannot read {path}: {e.strerror}") from None
-    return parse_scene(text, file=str(path), base=path.parent)
+    return _parse(text, str(path), path.parent)
 
 
 def parse_scene(text: str, *, file: str = "scene", base: Path | None = None) -> Scene:
     """A scene from TOML text; ``file`` names it in errors, ``base`` resolves its relative paths."""
+    return _parse(text, file, base)[0]
+
+
+def _parse(text: str, file: str, base: Path | None) -> tuple[Scene, Plan]:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as e:
         raise SceneError(f"{file}: {_syntax(str(e), text)}") from None
     lines = locate(text)
     scene, mistakes, moved = _validate(data)
+    plan: Plan | None = None
     if scene is not None:
         scene._base, scene._lines, scene._file = base, lines, file
         malformed = {str(m.path[0]) for m in mistakes if m.path}
-        for m in check(scene):
+        plan, further = try_plan(scene)
+        for m in further:
             index = moved.get(m.path[:2])
             path = m.path if index is None else (m.path[0], index, *m.path[2:])
             if not malformed.intersection(m.needs):
@@ -60,7 +71,8 @@ def parse_scene(text: str, *, file: str = "scene", base: Path | None = None) -> 
     if mistakes:
         raise report(mistakes, file, lines)
     assert scene is not None
-    return scene
+    assert plan is not None
+    return scene, plan
 
 
 def _syntax(message: str, text: str) -> str:
