@@ -21,10 +21,10 @@ def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: f
     ``trusted_until`` says when that begins. Infinite where the run at half the step has diverged.
     Raises KeyboardInterrupt when it was interrupted.
     """
-    if problem.tolerance is not None:
-        return _estimate_adaptive(engine, problem, segment)
-    half = dataclasses.replace(problem, step=problem.step / 2, sample_every=2 * problem.sample_every)
     replay = Replay(period, segment.tick_ctrl, segment.tick_qfrc) if period and len(segment.tick_t) else None
+    if problem.tolerance is not None:
+        return _estimate_adaptive(engine, problem, segment, replay)
+    half = dataclasses.replace(problem, step=problem.step / 2, sample_every=2 * problem.sample_every)
     span = (float(segment.t[0]), float(segment.t[-1]))
     finer = engine.run(half, span, replay)
     if finer.status == "interrupted":
@@ -47,11 +47,13 @@ def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: f
     )
 
 
-def _estimate_adaptive(engine: Engine, problem: Problem, segment: Segment) -> ErrorEstimate:
+def _estimate_adaptive(
+    engine: Engine, problem: Problem, segment: Segment, replay: Replay | None
+) -> ErrorEstimate:
     """Difference to a run at a hundredth of the tolerance, whose own error is small beside it."""
     assert problem.tolerance is not None
     tighter = dataclasses.replace(problem, tolerance=max(problem.tolerance / 100, 1e-14))
-    finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), None)
+    finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), replay)
     if finer.status == "interrupted":
         raise KeyboardInterrupt
     n = min(len(finer.t), len(segment.t))
