@@ -57,7 +57,7 @@ class ComputedTorque:
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
         m = self.model
-        middle = self.preview.at(t)
+        middle = self.preview.at(t, target)
         error, rate = difference(m, q, target.q), target.v - v
         a = middle.a + self.kp * error + self.kd * rate
         a = np.where(self.tracked, a, np.where(self.keyed, middle.a, 0.0))

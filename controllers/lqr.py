@@ -89,7 +89,7 @@ class LQR:
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
         tick = min(max(round(t / self.period), 0), len(self.gains) - 1)
-        wanted = self.preview.at(t)
+        wanted = self.preview.at(t, target)
         error = np.concatenate([difference(self.model, q, target.q), target.v - v])
         tau = self.nominal.inverse(*wanted) + self.gains[tick] @ error
         return np.where(self.tracked, tau, 0.0), None

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..sim.clip import Clip
 from ..sim.control import Target
+from .nominal import moved
 
 Array = NDArray[np.float64]
 
@@ -30,8 +31,21 @@ class Preview:
         """Targets at all times: q (ticks, nq), v and a (ticks, nv)."""
         return Target(*self.clip.evaluate(self.times))
 
-    def at(self, t: float) -> Target:
-        """The target ``offset`` periods after ``t`` [s]: from the grid where ``t`` is a tick of it."""
+    def at(self, t: float, now: Target) -> Target:
+        """The target ``offset`` periods after ``t`` [s], where it is ``now``: freedoms without keys, as
+        those of live goals, go on with their acceleration."""
+        ahead, clip, s = self._keyed(t), self.clip, self.offset * self.period
+        if not (now.v[~clip.dofs].any() or now.a[~clip.dofs].any()):
+            return Target(np.where(clip.qpos_mask, ahead.q, now.q), ahead.v, ahead.a)
+        q = moved(clip.model, now.q, s * now.v + 0.5 * s**2 * now.a)
+        return Target(
+            np.where(clip.qpos_mask, ahead.q, q),
+            np.where(clip.dofs, ahead.v, now.v + s * now.a),
+            np.where(clip.dofs, ahead.a, now.a),
+        )
+
+    def _keyed(self, t: float) -> Target:
+        """The keys ``offset`` periods after ``t``: from the grid where ``t`` is a tick of it."""
         tick = t / self.period
         k = round(tick)
         if abs(tick - k) > 1e-6 or not 0 <= k < len(self.times):

@@ -36,6 +36,8 @@ LAWS: dict[str, Callable[[], Callable[..., Law]]] = {
     "nmpc": _law("predictive.nonlinear", "NMPC"),
 }
 
+_FAR_SEEING = ("nmpc",)
+
 
 def make_law(
     name: str,
@@ -55,6 +57,11 @@ def make_law(
     from ..controllers.reality import LOOP_WORDS, with_reality
 
     check_law(name, parameters)
+    if problem.live is not None and name in _FAR_SEEING:
+        near = ", ".join(law for law in LAWS if law not in _FAR_SEEING)
+        raise SceneError(
+            f"law {name!r} looks far ahead, where live goals are not known yet; choose of: {near}"
+        )
     factory, believed = LAWS[name](), model or problem.model
     offered = {
         "model": believed,

@@ -21,7 +21,7 @@ _AFFINE_BIAS = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFIN
 
 
 class Target(NamedTuple):
-    """Where the keys want the scene: q (nq,), v (nv,), a (nv,)."""
+    """Where keys and live goals want the scene: q (nq,), v (nv,), a (nv,)."""
 
     q: Array
     v: Array
@@ -56,6 +56,7 @@ class Sampled:
         self.nu = problem.model.nu
         ticks = np.arange(int(np.ceil(problem.duration / period - 1e-9)) + 1) * period
         self.targets = self.clip.evaluate(ticks)
+        self.live = problem.live(period) if problem.live is not None else None
 
     def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
         """See :class:`~pantograph.sim.engines.interface.Controls`.
@@ -63,6 +64,8 @@ class Sampled:
         Raises EngineError for forces that are not finite; MuJoCo would take them for zero.
         """
         target = Target(self.targets.q[k], self.targets.v[k], self.targets.a[k])
+        if self.live is not None:
+            target = Target(*self.live.at(t, q, v, target))
         tau, self.memory = self.law(t, q, v, target, self.memory)
         qfrc = np.where(self.tracked, tau, 0.0)
         if not np.isfinite(qfrc).all():

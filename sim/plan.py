@@ -17,6 +17,7 @@ from .engines.smooth import methods as smooth_methods
 from .engines.touch import can_touch
 from .errors import SceneError, unknown
 from .scene.build import Setup, resolve
+from .scene.live import samples
 from .scene.mistakes import Mistake, SceneMistakes, report
 from .scene.schema import Scene
 
@@ -35,7 +36,8 @@ class Choice:
 class Plan:
     """How a scene is computed.
 
-    ``period`` [s] is the controller's, None without one. ``left_out`` and ``cheaper`` are sentences.
+    ``period`` [s] is the controller's, None without one. ``left_out`` and ``cheaper`` are sentences;
+    ``goals`` says of every goal by name whether it is baked or live.
     """
 
     setup: Setup
@@ -46,6 +48,7 @@ class Plan:
     period: float | None
     left_out: tuple[str, ...]
     cheaper: tuple[str, ...]
+    goals: tuple[tuple[str, Choice], ...] = ()
 
     def joints(self, role: Role) -> tuple[str, ...]:
         """Names of the joints in a role."""
@@ -106,6 +109,7 @@ def plan_setup(setup: Setup) -> Plan:
         servo=setup.servo,
         wrenches=setup.wrenches,
         tolerance=scene.solver.tolerance,
+        live=setup.live,
     )
     if mistakes := _law(problem, scene):
         raise report(mistakes, scene._file, scene._lines)
@@ -118,7 +122,24 @@ def plan_setup(setup: Setup) -> Plan:
         period,
         tuple(_left_out(setup, engine.what) + _other_physics(problem, engine.what)),
         tuple(_cheaper(setup, engine.what, integrator.what, touch)),
+        tuple(_goals(setup, period)),
     )
+
+
+def _goals(setup: Setup, period: float | None) -> list[tuple[str, Choice]]:
+    """How each goal of the scene is solved."""
+    out = []
+    for name, how, why in setup.goals.choices:
+        if how == "live":
+            every = "tick by tick before the run, for nothing is left to physics"
+            if setup.live is not None and period:
+                every = f"every {period * samples(period):g} s"
+            moving = [int(j) for j in setup.goals.live_joints]
+            v = max(float(setup.goals.velocity[setup.model.dof_jntid == j].max()) for j in moving)
+            a = max(float(setup.goals.acceleration[setup.model.dof_jntid == j].max()) for j in moving)
+            how = f"live, {every}, joints up to {v:.3g} rad/s (m/s) and {a:.3g} rad/s^2 (m/s^2)"
+        out.append((name, Choice(how, why)))
+    return out
 
 
 def _solver(scene: Scene) -> list[Mistake]:

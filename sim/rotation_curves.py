@@ -107,6 +107,15 @@ def keyed_rotation(
     )
 
 
+def through(times: Array, quats: Array, rates: Array) -> RotationCurve:
+    """C1 curve through rotations `quats` (k, 4) at `times` (k,) [s] with angular velocities `rates` (k, 3) in
+    the body's frame [rad/s]; it ends held. Raises KeyingError for neighbours half a turn apart."""
+    q = _same_side(normalize(quats))
+    coefficients = _cubics(np.diff(times), _arcs(times, q), rates)
+    t = frozen(times.copy())
+    return RotationCurve(t, frozen(q), t, "hold", "hold", frozen(q[:-1].copy()), frozen(coefficients))
+
+
 def _same_side(q: Array) -> Array:
     """Keys (k, 4) with signs such that each is nearest to the one before."""
     sign = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)

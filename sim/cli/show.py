@@ -120,6 +120,8 @@ def plan(console: Console, plan: Plan) -> None:
         joints = plan.joints(role)
         if joints:
             table.add_row(f"{role.name.lower()} joints", escape(", ".join(joints)))
+    for name, choice in plan.goals:
+        table.add_row(f"goal {escape(name)}", escape(f"{choice.what}: {choice.why}"))
     if plan.setup.coupled:
         table.add_row("coupled", f"{escape(', '.join(plan.setup.coupled))}: follow keyed joints by the model")
     for drive in (Drive.KEYS, Drive.CONTROLLER):

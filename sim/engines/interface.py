@@ -70,6 +70,15 @@ class Wrench:
     stop: float = np.inf
 
 
+class Aims(Protocol):
+    """Targets that are found while a run goes on, for joints that no keys move."""
+
+    def at(self, t: float, q: Array, v: Array, target: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+        """``target`` (q (nq,), v (nv,), a (nv,)) with these joints where they belong at time ``t`` [s], seen
+        from state q, v; called once a tick, in order."""
+        ...
+
+
 @dataclass(frozen=True)
 class Problem:
     """A scene made ready for an engine.
@@ -78,6 +87,7 @@ class Problem:
     ``clip`` holds the motion of keyed and tracked joints; ``roles`` has one role a joint.
     ``servo`` maps an actuator driven by keys to its ctrl over time: t (n,) -> (n,).
     ``sample_every`` steps lie between two recorded samples. ``tolerance`` asks for adaptive steps.
+    ``live`` makes, for a controller's period [s], the targets of tracked joints that follow goals live.
     """
 
     model: mujoco.MjModel
@@ -92,6 +102,7 @@ class Problem:
     servo: dict[int, Callable[[Array], Array]] = field(default_factory=dict)
     wrenches: tuple[Wrench, ...] = ()
     tolerance: float | None = None
+    live: Callable[[float], Aims] | None = None
 
     @property
     def steps(self) -> int:
@@ -118,7 +129,7 @@ class Segment:
     """Motion that an engine computed, at its sample times.
 
     t (n,), q (n, nq), v (n, nv), act (n, na); ticks hold the controller's samples: tick_t (m,),
-    tick_ctrl (m, nu), tick_qfrc (m, nv). ``status`` is 'done', 'diverged' or 'interrupted';
+    tick_ctrl (m, nu), tick_qfrc (m, nv). ``status`` is 'done', 'diverged', 'interrupted' or 'failed';
     ``message`` says why a run stopped early. An engine with physics of its own adds the ``events`` that it
     located, accelerations ``a`` (n, nv), and ``drive`` (n, nv), what drives of keyed freedoms give.
     """

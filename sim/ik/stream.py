@@ -37,6 +37,7 @@ _CLOSE = 1e-20
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 4  # linearisations a tick
+_CALM = 0.3  # of the greatest velocity, below which a configuration ahead counts as at rest
 _STRIDE = 0.5  # [rad or m] of one of them in search of where to brake
 
 
@@ -181,8 +182,10 @@ class Follower:
         """Steps (nv,) between `low` and `high` after which joints can still stop where the goals are met."""
         if not np.isfinite(self.a_max[problem.moved]).any():
             return low, high
-        away, speed = self._seek(problem)
+        away, moved, speed = self._seek(problem)
         a = np.where(problem.moved, self.a_max, np.inf)
+        if not self._catches_up(moved, away - moved * self.dt, a):
+            return low, high
         gap = away - speed * self.dt  # left when the goals' own motion is taken off
         most = self.dt * (speed + _braking(np.maximum(gap, 0.0), a, self.dt))
         least = self.dt * (speed - _braking(np.maximum(-gap, 0.0), a, self.dt))
@@ -194,8 +197,18 @@ class Follower:
             np.where(bounded, np.clip(most, low, high), high),
         )
 
-    def _seek(self, problem: Problem) -> tuple[Array, Array]:
-        """Way (nv,) from here to a configuration that meets the goals, and the velocity (nv,) it has."""
+    def _catches_up(self, moved: Array, gap: Array, a: Array) -> bool:
+        """Whether slowing down serves: the configuration ahead can be followed, and rests or is near.
+
+        Where it runs away, as past a singularity, joints that waited for it could not stand in for slow ones.
+        """
+        calm = np.abs(moved) <= _CALM * self.v_max
+        near = np.abs(gap) <= np.where(np.isfinite(a), 0.5 * self.v_max**2 / a, np.inf)
+        return bool((np.abs(moved) <= self.v_max).all() and (calm.all() or near.all()))
+
+    def _seek(self, problem: Problem) -> tuple[Array, Array, Array]:
+        """Way (nv,) from here to a configuration that meets the goals, how fast it moved since the last tick
+        (nv,), and its velocity (nv,): zero where it has begun to move or jumped."""
         last = self._aim
         aim = self.q if last is None else np.where(self.space.coordinates(problem.moved), last, self.q)
         weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
@@ -217,11 +230,9 @@ class Follower:
         moved: Array = np.zeros(self.model.nv)
         if last is not None:
             moved = self.space.difference(aim[None], last[None])[0] / self.dt * problem.moved
-        # a goal that jumped has no velocity; one that goes on has that of the last two ticks
         steady = np.abs(moved - self._aim_v) <= np.minimum(self.a_max, 1e6) * self.dt * (1 + 1e-9)
-        speed = np.where(steady & (np.abs(moved) <= self.v_max), moved, 0.0)
         self._aim, self._aim_v = aim, moved
-        return self.space.difference(aim[None], self.q[None])[0], speed
+        return self.space.difference(aim[None], self.q[None])[0], moved, np.where(steady, moved, 0.0)
 
     def _allowed(self) -> list[float]:
         """Least distance of every pair of geoms after this tick (velocity damper)."""

@@ -5,30 +5,29 @@ The smoothest motion near the goals is found at once for all instants t_k (seque
     least  sum |r_k / tolerance|^2 + sum |(q_k+1 - 2 q_k + q_k-1) / (dt^2 a)|^2
     with   joint ranges, |q_k+1 - q_k| <= v_max dt, |q_k+1 - 2 q_k + q_k-1| <= a_max dt^2
 
-whose matrices are banded, so that the cost grows linearly with the number of instants.
+whose matrices are banded, so that the cost grows linearly with the number of instants. With limits of
+velocity or acceleration the q_k are control points of a quadratic B-spline, which keeps them at every time
+(`spline.py`), and r_k is taken on it; without, the motion is a natural cubic spline through them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...models.naming import name_of
-from ..clip import Clip, FreeTrack, Track
-from ..curves import keyed
+from ..clip import Clip
 from ..errors import ModelError
-from ..kinds import BALL, FREE
-from ..rotation_curves import keyed_rotation
 from .goals import Goal
 from .numeric.band import Limits, smoothest_step
 from .pose import Kinematics
 from .problem import Problem
 from .solve import residuals, solve
 from .space import Space
+from .spline import on_curve, smooth_clip, spline_clip
 from .stream import Follower, frozen, limit
 from .verdict import Residual, Verdict
 
@@ -56,12 +55,13 @@ class Motion:
     """Joint motion along goals.
 
     Attributes:
-        t (k,), q (k, nq), v (k, nv), a (k, nv): instants, configurations, and velocities and accelerations by
-            central differences.
+        t (k,), q (k, nq), v (k, nv), a (k, nv): instants, configurations, velocities and accelerations (with
+            limits those of the curves, otherwise central differences).
         position, rotation (k,): deviation from the judged goals [m], [rad].
         missed: stretches where they are not within tolerance; a verdict where the goals themselves cannot be
             met there, none where limits of velocity or acceleration are the reason.
-        speed, effort: largest |velocity| and |acceleration| over their limits; 0 without limits.
+        speed, effort: largest |velocity| and |acceleration| of the curves, at any time, over their limits; 0
+            without limits.
     """
 
     model: mujoco.MjModel
@@ -74,6 +74,7 @@ class Motion:
     missed: tuple[Missed, ...]
     speed: float
     effort: float
+    curves: Clip = field(repr=False)
 
     @property
     def followed(self) -> bool:
@@ -81,24 +82,9 @@ class Motion:
         return not self.missed
 
     def clip(self) -> Clip:
-        """The motion as a clip: curves through all instants, of every joint that moves."""
-        model, tracks = self.model, dict[str, Track]()
-        for j in range(model.njnt):
-            q, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
-            wide = {FREE: 7, BALL: 4}.get(kind, 1)
-            if np.ptp(self.q[:, q : q + wide], axis=0).max() < 1e-12:
-                continue
-            name = name_of(model, "joint", j)
-            if kind == FREE:
-                place = keyed(self.t, self.q[:, q : q + 3], kind="natural")
-                tracks[name] = FreeTrack(
-                    place, keyed_rotation(self.t, self.q[:, q + 3 : q + 7], kind="natural")
-                )
-            elif kind == BALL:
-                tracks[name] = keyed_rotation(self.t, self.q[:, q : q + 4], kind="natural")
-            else:
-                tracks[name] = keyed(self.t, self.q[:, q], kind="natural")
-        return Clip(model, tracks, self.q[0])
+        """The motion as curves, of all joints that move: through q at all instants, and within the limits of
+        velocity and acceleration at every time between them."""
+        return self.curves
 
 
 def follow(
@@ -126,8 +112,9 @@ def follow(
         raise ModelError("a track needs at least three evenly spaced, increasing times")
     if around is not None and q0 is None:
         q0 = np.asarray(around, dtype=float)[0]
-    line = _Line(model, goals, t, joints, around)
     v_max, a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
+    bounded = bool(np.isfinite([v_max, a_max]).any())
+    line = _Line(model, goals, t, joints, around, bounded=bounded)
     q = _first_guess(line, q0, start, v_max, a_max)
     limits = Limits(line.space, float(t[1] - t[0]), v_max, a_max, start is not None)
     q = _smoothed(line, q, limits, iterations)
@@ -144,8 +131,11 @@ class _Line:
         t: Array,
         joints: Sequence[str] | None,
         around: ArrayLike | None,
+        *,
+        bounded: bool,
     ):
         self.model, self.t, self.space, self.joints = model, t, Space(model), joints
+        self.bounded = bounded
         kinematics = Kinematics(model)
         self.problems = [
             Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t
@@ -160,10 +150,22 @@ class _Line:
         """q (nq,) with the joints that do not move for the goals as they are at instant k."""
         return q if self.around is None else np.where(self._ours, q, self.around[k])
 
+    def on_curve(self, q: Array) -> Array:
+        """Where the motion of control points q (k, nq) is at the instants."""
+        return np.where(self._ours, on_curve(self.space, q), q) if self.bounded else q
+
+    def clip(self, q: Array) -> Clip:
+        """The motion of control points q (k, nq) as curves."""
+        moving = self.moved | (np.ptp(self.space.difference(q, q[:1]), axis=0) > 1e-12)
+        joints = sorted({int(j) for j in self.model.dof_jntid[moving]})
+        make = spline_clip if self.bounded else smooth_clip
+        return make(self.model, self.t, q, joints)
+
     def rows(self, q: Array) -> list[tuple[Array, Array]]:
-        """Weighted residuals and Jacobians of every instant; judged rows count most."""
+        """Weighted residuals of every instant and their Jacobians, as if each depended on its own control
+        point alone (three quarters of it do); judged rows count most."""
         out = []
-        for problem, x in zip(self.problems, q, strict=True):
+        for problem, x in zip(self.problems, self.on_curve(q), strict=True):
             w = problem.weighted(problem.raw(x[None]))
             weight = np.where(problem.judged, 1.0, 1e-2) / _TRACKING
             out.append((w.r[0] * weight, w.J[0] * weight[:, None]))
@@ -228,12 +230,14 @@ def _smoothed(line: _Line, q: Array, limits: Limits, iterations: int) -> Array:
     return q
 
 
-def _motion(line: _Line, q: Array, limits: Limits) -> Motion:
+def _motion(line: _Line, c: Array, limits: Limits) -> Motion:
+    """The motion of control points c (k, nq) and what it leaves of the goals."""
     space, dt = line.space, limits.dt
-    steps = space.difference(q[1:], q[:-1]) / dt
+    steps = space.difference(c[1:], c[:-1]) / dt
     v = np.concatenate([steps[:1], 0.5 * (steps[1:] + steps[:-1]), steps[-1:]])
     inner = np.diff(steps, axis=0) / dt
     a = np.concatenate([inner[:1], inner, inner[-1:]])
+    q = line.on_curve(c)
     reports = [residuals(p, x) for p, x in zip(line.problems, q, strict=True)]
     judged = [_judged(p, report) for p, report in zip(line.problems, reports, strict=True)]
     position = np.array([max((r.position for r in rs), default=0.0) for rs in judged])
@@ -242,7 +246,7 @@ def _motion(line: _Line, q: Array, limits: Limits) -> Motion:
     missed = _stretches(line, q, off, position, rotation)
     t, q, v, a, position, rotation = (frozen(x) for x in (line.t, q, v, a, position, rotation))
     speed, effort = limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max)
-    return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort)
+    return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort, line.clip(c))
 
 
 def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:

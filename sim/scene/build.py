@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from ...models import captured_warnings, name_of
 from ..clip import Clip
 from ..control import is_position_servo, why_not_controllable
-from ..engines.interface import Array, Drive, Role, State, Wrench
+from ..engines.interface import Aims, Array, Drive, Role, State, Wrench
 from ..engines.prescribe import prescribed_bodies
 from ..errors import PantographError, SceneError
 from ..kinds import BALL, FREE, HINGE, SCALAR
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
 from .floors import Floors, unite
-from .goals import bake
+from .goals import Goals, assign, bake
+from .live import chaser, settle_roles, streamed
 from .mistakes import Mistake
 from .motion import Curves, constant_or_keyed, curves
 from .names import Names
@@ -32,7 +33,8 @@ class Setup:
 
     ``model`` has the scene's switches applied, ``as_filed`` has none of them. ``coupled`` names joints that
     follow a keyed joint through an equality of the model, ``overruled`` options of further models that
-    differ from those of the first, ``floors`` planes for which others stand.
+    differ from those of the first, ``floors`` planes for which others stand. ``goals`` says which goals are
+    baked and which live; ``live`` makes the targets of those that a controller follows.
     """
 
     scene: Scene
@@ -48,6 +50,8 @@ class Setup:
     state0: State
     overruled: tuple[str, ...]
     floors: Floors
+    goals: Goals
+    live: Callable[[float], Aims] | None
 
 
 def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
@@ -68,17 +72,22 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     mistakes += wrong
     state0, wrong = _initial(scene, model)
     mistakes += wrong
+    goals = Goals()
     if scene.goals and not mistakes:
-        mistakes += bake(scene, model, found, state0.q)
-    roles, wrong = _roles(scene, model, found)
+        goals, mistakes = assign(scene, model, found)
+        mistakes += bake(scene, model, found, state0.q, goals)
+    roles, wrong = _roles(scene, model, found, goals)
     mistakes += wrong
+    if goals.live and not mistakes and not (roles != Role.KEYED).any():
+        moving = streamed(model, goals, found, state0.q, scene.duration, scene.rate)
+        found.tracks.update({model.joint(name).id: track for name, track in moving.tracks.items()})
     mistakes += apply_contacts(spec, model, scene, floors)
     wrenches, wrong = _wrenches(scene, model)
     mistakes += wrong
     mistakes += _film_names(scene, model)
     if mistakes:
         # drives need settled roles; their own mistakes still belong into the report
-        return None, mistakes + _drives(scene, model, roles, found)[2]
+        return None, mistakes + _drives(scene, model, roles, found, goals)[2]
     try:
         clip, coupled = _clip(model, found, roles, state0.q)
     except PantographError as e:
@@ -90,25 +99,17 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     clip = Clip(model, clip.tracks, clip.q0)
     _switches(scene, model)
     _silence_equalities(model, prescribed, roles)
-    drives, servo, wrong = _drives(scene, model, roles, found, clip)
+    drives, servo, wrong = _drives(scene, model, roles, found, goals, clip)
     if wrong:
         return None, wrong
     state0 = _start_on_keys(scene, model, roles, clip, state0)
+    live = None
+    if goals.live and (roles != Role.KEYED).any():
+        live = chaser(model, goals, state0.q, state0.v)
     setup = Setup(
-        scene,
-        model,
-        as_filed,
-        roles,
-        clip,
-        found,
-        coupled,
-        drives,
-        servo,
-        wrenches,
-        state0,
-        overruled,
-        floors,
-    )
+        scene, model, as_filed, roles, clip, found, coupled, drives, servo, wrenches, state0, overruled,
+        floors, goals, live,
+    )  # fmt: skip
     return setup, []
 
 
@@ -139,8 +140,11 @@ def _law(scene: Scene) -> list[Mistake]:
     return mistakes
 
 
-def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[np.int8], list[Mistake]]:
-    """Role of each joint: named ones as the scene says, joints with keys keyed, the others passive."""
+def _roles(
+    scene: Scene, model: mujoco.MjModel, found: Curves, goals: Goals
+) -> tuple[NDArray[np.int8], list[Mistake]]:
+    """Role of each joint: named ones as the scene says, joints with keys keyed, the others passive; those
+    that follow live goals are tracked, or keyed where nothing is left for physics to move."""
     roles = np.full(model.njnt, Role.PASSIVE, dtype=np.int8)
     roles[list(found.tracks)] = Role.KEYED
     joints, mistakes = Names(model, "joint"), []
@@ -160,8 +164,9 @@ def _roles(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[NDArray[
                 elif j in exact:
                     continue
                 roles[j] = role
+    mistakes += settle_roles(scene, model, roles, goals.live_joints, set(exact))
     for keyed in np.flatnonzero(roles == Role.KEYED):
-        if int(keyed) not in found.tracks:
+        if int(keyed) not in found.tracks and int(keyed) not in goals.live_joints:
             name = name_of(model, "joint", int(keyed))
             message = f"joint {name!r} is keyed but has no keys; add [[keys]] joint = {name!r}"
             mistakes.append(Mistake(("roles", "keyed"), message, needs=("keys",)))
@@ -259,11 +264,18 @@ def _wrenches(scene: Scene, model: mujoco.MjModel) -> tuple[tuple[Wrench, ...], 
 
 
 def _drives(
-    scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, clip: Clip | None = None
+    scene: Scene,
+    model: mujoco.MjModel,
+    roles: NDArray[np.int8],
+    found: Curves,
+    goals: Goals,
+    clip: Clip | None = None,
 ) -> tuple[NDArray[np.int8], dict[int, Callable[[Array], Array]], list[Mistake]]:
     """What drives each actuator, as the scene says or as its joint's role suggests."""
     actuators, mistakes = Names(model, "actuator"), []
-    drives = np.array([_suggested(scene, model, roles, found, i) for i in range(model.nu)], dtype=np.int8)
+    drives = np.array(
+        [_suggested(scene, model, roles, found, goals, i) for i in range(model.nu)], dtype=np.int8
+    )
     said: dict[int, str] = {}
     for pattern, word in scene.actuators.items():
         ids = actuators.match(pattern)
@@ -282,6 +294,11 @@ def _drives(
         elif drives[i] == Drive.CONTROLLER:
             if reason := why_not_controllable(model, i):
                 mistakes.append(Mistake(path, f"no controller can drive actuator {name!r}: {reason}"))
+        elif _on_joint(model, i) and int(model.actuator_trnid[i, 0]) in goals.live_joints:
+            message = (
+                f"actuator {name!r} drives a joint that follows a live goal: 'controller' drives it, not keys"
+            )
+            mistakes.append(Mistake(path, message))
         elif i in found.actuators:
             curve = found.actuators[i]
             servo[i] = lambda t, curve=curve: curve(t).q[:, 0]  # type: ignore[misc]
@@ -294,7 +311,9 @@ def _drives(
     return drives, servo, mistakes
 
 
-def _suggested(scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, i: int) -> Drive:
+def _suggested(
+    scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, goals: Goals, i: int
+) -> Drive:
     if i in found.actuators:
         return Drive.KEYS
     if not _on_joint(model, i):
@@ -304,7 +323,8 @@ def _suggested(scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], fou
     servo = is_position_servo(model, i)
     if why_not_controllable(model, i):
         return Drive.KEYS if servo else Drive.OFF
-    return Drive.KEYS if servo and scene.controller is None else Drive.CONTROLLER
+    live = int(model.actuator_trnid[i, 0]) in goals.live_joints
+    return Drive.KEYS if servo and scene.controller is None and not live else Drive.CONTROLLER
 
 
 def _on_joint(model: mujoco.MjModel, i: int) -> bool:

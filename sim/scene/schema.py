@@ -184,6 +184,20 @@ class GoalItem(Item):
     rotation: list[Row] | None = Field(None, description="w, x, y, z or euler x, y, z, one row a time")
     look_at: list[Vector] | None = Field(None, description="point that its axis points to, one row a time")
     axis: Vector = Field((0.0, 0.0, 1.0), description="local axis that looks")
+    relative_to: str | None = Field(
+        None, description="site or body:NAME that carries the goal; default world"
+    )
+    solve: Literal["auto", "baked", "live"] = Field(
+        "auto",
+        description="before the run, smooth over all of it; or live, tick by tick from the state of the run",
+    )
+    velocity: Positive | None = Field(
+        None,
+        description="limit of its joints, scene angles or metres a second; live default: half a turn, 1 m",
+    )
+    acceleration: Positive | None = Field(
+        None, description="likewise, per second squared; live default: 3 turns, 10 m"
+    )
     weight: Positive | None = Field(None, description="a wish of this weight; without it, a hard goal")
     joints: list[str] = Field(default_factory=list, description="names or patterns; default all that move it")
     curve: Curve = "auto"
