@@ -19,7 +19,7 @@ from .wholes import Posture
 Array = NDArray[np.float64]
 Preference = Literal["near", "middle", "manipulability", "clear"]
 PREFERENCES: tuple[Preference, ...] = ("near", "middle", "manipulability", "clear")
-_FAINT = 1e-4  # preferences beside wishes: rows this much smaller
+FAINT = 1e-4  # preferences beside wishes: rows this much smaller
 
 
 def wishes(problem: Problem, prefer: Wish) -> Wish:
@@ -28,7 +28,7 @@ def wishes(problem: Problem, prefer: Wish) -> Wish:
     def rows(q: Array) -> Rows:
         faint, w = prefer(q), problem.weighted(problem.raw(q))
         return Rows(
-            np.concatenate([w.r, _FAINT * faint.r], axis=1), np.concatenate([w.J, _FAINT * faint.J], axis=1)
+            np.concatenate([w.r, FAINT * faint.r], axis=1), np.concatenate([w.J, FAINT * faint.J], axis=1)
         )
 
     return rows

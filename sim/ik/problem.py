@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...models.naming import joint_names, lookup, name_of
 from ..errors import ModelError, unknown
+from .chains.machine import Prepared, charge, prepared, structure
 from .goals import BAND, Goal, Rows
 from .loops import Closure, closures
 from .pose import Kinematics
@@ -35,6 +37,7 @@ class Problem:
         judged (m,): rows that must vanish: of hard goals (of all goals when none is hard) and of loops.
         tolerance (m,): of every row.
         moved (nv,): freedoms that may change.
+        wished: goals beside these that are met as well as these allow, if any.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class Problem:
         joints: Sequence[str] | None = None,
         kinematics: Kinematics | None = None,
     ):
+        self.wished: Problem | None = None
         if not goals:
             raise ModelError("inverse kinematics needs at least one goal")
         self.model, self.space, self.goals = model, space, tuple(goals)
@@ -58,6 +62,8 @@ class Problem:
         self._layout()
 
     def _layout(self) -> None:
+        self._name: str | None = None
+        self._prepared: Prepared | None = None
         hard = [g.weight is None for g in self.goals]
         strict = hard if any(hard) else [True] * len(hard)
         scale = length_of(self.model, self.kinematics, self.goals)
@@ -91,13 +97,29 @@ class Problem:
         self.weight, self.band = np.concatenate(weight), np.concatenate(band)
         self.metres, self.scale = np.concatenate(metres).astype(bool), scale
 
+    def prepared(self, *, build: bool = False) -> Prepared | None:
+        """Machine code for this problem, if there is any by now; with `build`, made where it pays."""
+        if self._name is None:
+            self._name = structure(self) or ""
+            if self._name:
+                self._prepared = prepared(self, self._name)
+        if build and self._name and self._prepared is None:
+            self._prepared = prepared(self, self._name, build=True)
+        return self._prepared
+
     def raw(self, q: Array) -> Rows:
         """Residuals (n, m) [m or rad] and Jacobian (n, m, nv), without weights."""
+        quick = self.prepared()
+        if quick is not None:
+            return quick.machine.rows(q, quick.a)
+        begin = time.perf_counter()
         c = self.kinematics.at(q)
         parts = [g.rows(c) for g in self.goals] + [loop.rows(c) for loop in self.loops]
         J = np.concatenate([p.J for p in parts], axis=1)
         J[:, :, ~self.moved] = 0.0
-        return Rows(np.concatenate([p.r for p in parts], axis=1), J)
+        rows = Rows(np.concatenate([p.r for p in parts], axis=1), J)
+        charge(self._name or "", 2 * (time.perf_counter() - begin))  # linear algebra costs as much again
+        return rows
 
     def weighted(self, rows: Rows) -> Rows:
         """Rows as the solver sees them: bands taken off, free rows zero, metres over the model's length."""
@@ -167,5 +189,7 @@ def freedom_names(model: mujoco.MjModel, mask: NDArray[np.bool_]) -> tuple[str, 
 def unwound(problem: Problem, q: Array, to: Array) -> Array:
     """`q` (n, nq) with whole turns of hinges undone towards `to`, where that changes no residual."""
     near = problem.space.nearest_turns(q, to)
+    if np.array_equal(near, q):
+        return near
     change = np.abs(problem.raw(near).r - problem.raw(q).r).max(axis=1, initial=0.0)
     return np.where((change < 1e-9)[:, None], near, q)

@@ -14,8 +14,8 @@ from .chains.closed_form import candidates
 from .goals import Goal
 from .numeric.descend import Descent, sharpen, tighten
 from .numeric.search import Search
-from .numeric.settle import Wish, settle
-from .preferences import Preference, preference, wishes
+from .numeric.settle import Settled, Wish, settle, settle_near
+from .preferences import FAINT, Preference, preference, wishes
 from .problem import Problem, unwound
 from .proofs.diagnose import diagnose, excluded
 from .space import Space
@@ -65,7 +65,7 @@ def solve(
     if len(found) and (all or prefer != "near"):  # what is best may lie far from the start
         found = np.concatenate([found, search.more(restarts if all else min(restarts, 40))])
     if len(found):
-        best = _settled(judged, space, found, wish, start, every=all)
+        best = _settled(judged, found, wish, start, every=all, near=prefer == "near")
         verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
         return _solution(problem, best[0], verdict, best if all else best[:1], None, search, begin)
     nearest = _nearest(judged, search.best)
@@ -74,7 +74,7 @@ def solve(
         return _solution(problem, nearest.q[0], verdict, nearest.q, None, search, begin)
     diagnosis = diagnose(judged, search, nearest)
     if diagnosis.found is not None:
-        best = _settled(judged, space, diagnosis.found[None], wish, start, every=False)
+        best = _settled(judged, diagnosis.found[None], wish, start, every=False, near=prefer == "near")
         verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
         return _solution(problem, best[0], verdict, best, None, search, begin)
     q = diagnosis.nearest
@@ -95,21 +95,25 @@ def _parts(problem: Problem) -> tuple[Problem, Problem | None]:
     judged, wished = problem.only(hard), problem.only(soft)
     judged.moved, wished.moved = problem.moved, problem.moved
     wished.loops, judged.loops = [], problem.loops
+    judged.wished = wished
     judged._layout()
     wished._layout()
     return judged, wished
 
 
-def _settled(judged: Problem, space: Space, found: Array, wish: Wish, start: Array, *, every: bool) -> Array:
+def _settled(judged: Problem, found: Array, wish: Wish, start: Array, *, every: bool, near: bool) -> Array:
     """Distinct solutions (k, nq) that serve the wish best, best first."""
     found = unwound(judged, found, start)
-    value = np.array([np.sum(wish(q[None]).r ** 2) for q in found])
-    settled = []
-    for i in np.argsort(value, kind="stable")[: None if every else 5]:
-        end = settle(judged, found[i], wish)
-        settled.append((end.value, unwound(judged, tighten(judged, end.q)[None], start)[0]))
-    settled.sort(key=lambda pair: pair[0])
-    return distinct(space, np.array([q for _, q in settled]))
+    value = np.sum(wish(found).r ** 2, axis=1)
+    picked = found[np.argsort(value, kind="stable")[: None if every else 5]]
+    ends: list[Settled]
+    if near:
+        ends = settle_near(judged, picked, start, wish, faint=1.0 if judged.wished is None else FAINT)
+    else:
+        ends = [settle(judged, q, wish) for q in picked]
+    ends.sort(key=lambda end: end.value)
+    q = np.array([tighten(judged, end.q) for end in ends])
+    return distinct(judged.space, unwound(judged, q, start))
 
 
 def distinct(space: Space, q: Array, *, apart: float = 1e-3) -> Array:

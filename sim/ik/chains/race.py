@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...compile import jit
 from ...compile.cache import Cache, default_folder, key_of
-from ...compile.llvm import Emitter, declarations, double, kernel
+from ...compile.kernels import kernel
+from ...compile.llvm import Emitter, declarations, double
 from ...compile.loops import declare, function
 from ...compile.program import address, facts_of, obtain
-from ...compile.rollout import splat
 from .step import Chain, step_tape
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def race_loop(chain: Chain, lanes: int) -> str:
         result = e.element("%q", e.emit(f"mul nsw i64 {at}, {n}"), "double")
         with e.loop(14) as i:
             x = e.emit(f"load double, ptr {e.element(target, i, 'double')}, align 8")
-            e.store(splat(e, x), T, i)
+            e.store(e.splat(x), T, i)
         for lane in range(lanes):
             row = seed if lane == 0 else e.element("%table", (lane - 1) * n, "double")
             _fill(e, row, Q, lane, n)
@@ -183,7 +183,12 @@ class Racer:
 @lru_cache(maxsize=1)
 def _source() -> str:
     here = Path(__file__).parent
-    files = [here / "race.py", here / "step.py", *sorted((here.parents[1] / "compile").glob("*.py"))]
+    files = [
+        here / "race.py",
+        here / "step.py",
+        here / "algebra.py",
+        *sorted((here.parents[1] / "compile").glob("*.py")),
+    ]
     return key_of(*(file.read_bytes() for file in files))
 
 

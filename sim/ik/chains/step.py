@@ -9,19 +9,18 @@ from the joints' side, (W J^T J W + lambda I) d = -W J^T e.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compile.graph import Graph, Scalar, absolute, clip, cos, less, maximum, minimum, sin, sqrt
+from ...compile.graph import Graph, Scalar, absolute, clip, less, maximum, minimum, sqrt
 from ...compile.tape import Tape
 from ...kinds import HINGE, SLIDE
 from ...kinematics import Frame
+from .algebra import Vector, cross, dot, offset, solved, spun, total
 
 Array = NDArray[np.float64]
-Vector = list[Scalar]
 _LEAST = 1e-11
 _MU = 0.03
 _LONGEST = 0.8  # [rad, or the chain's length] a step
@@ -65,19 +64,20 @@ def step_tape(chain: Chain) -> Tape:
     graph = Graph()
     q, t = graph.inputs("q", chain.n), graph.inputs("t", 14)
     e, error, J = _residual(chain, list(q), list(t))
-    g = [_dot(column, e) for column in J]
+    g = [dot(column, e) for column in J]
     W = [_free(x, y, *limits) for x, y, limits in zip(q, g, chain.limits.tolist(), strict=True)]
-    damping = _MU * _dot(e, e) + _LEAST
+    damping = _MU * dot(e, e) + _LEAST
     if chain.n >= len(e):
         A = [
-            [_total(w * c[i] * c[k] for w, c in zip(W, J, strict=True)) for k in range(i + 1)]
+            [total(w * c[i] * c[k] for w, c in zip(W, J, strict=True)) for k in range(i + 1)]
             for i in range(len(e))
         ]
-        y = _solve(A, damping, e)
-        d = [-(w * _dot(c, y)) for w, c in zip(W, J, strict=True)]
+        y = solved(A, [damping] * len(e), e)
+        d = [-(w * dot(c, y)) for w, c in zip(W, J, strict=True)]
     else:
-        A = [[W[i] * W[k] * _dot(J[i], J[k]) for k in range(i + 1)] for i in range(chain.n)]
-        d = [-x for x in _solve(A, damping, [w * x for w, x in zip(W, g, strict=True)])]
+        A = [[W[i] * W[k] * dot(J[i], J[k]) for k in range(i + 1)] for i in range(chain.n)]
+        b = [w * x for w, x in zip(W, g, strict=True)]
+        d = [-x for x in solved(A, [damping] * chain.n, b)]
     longest = absolute(d[0])
     for x in d[1:]:
         longest = maximum(longest, absolute(x))
@@ -116,7 +116,7 @@ def _residual(chain: Chain, q: Vector, t: Vector) -> tuple[Vector, Scalar, list[
         else:
             if chain.position:
                 arm = [a - b for a, b in zip(p, origin, strict=True)]
-                column += [inverse * x for x in _cross(axis, arm)]
+                column += [inverse * x for x in cross(axis, arm)]
             column += axis if chain.rotation else []
         J.append(column)
     return e, error, J
@@ -129,8 +129,8 @@ def _turning(R: list[Vector], t: Vector) -> Vector:
     for k in range(3):
         r = [R[i][k] for i in range(3)]
         c = [t[3 * i + k] for i in range(3)]
-        s = [a + b for a, b in zip(s, _cross(c, r), strict=True)]
-        trace = trace + _dot(r, c)
+        s = [a + b for a, b in zip(s, cross(c, r), strict=True)]
+        trace = trace + dot(r, c)
     # cos(angle / 2) = sqrt(1 + trace) / 2, kept away from a half turn
     half = 1.0 / sqrt(maximum(trace + 1.0, 1e-4))
     return [x * half for x in s]
@@ -142,26 +142,16 @@ def _walk(frame: Frame, q: Vector) -> tuple[list[tuple[Vector, Vector]], list[Ve
     p: Vector = [0.0, 0.0, 0.0]
     out = []
     for joint, x in zip(frame.joints, q, strict=True):
-        R, p = _offset(R, p, joint.X)
+        R, p = offset(R, p, joint.X)
         if int(joint.type) == SLIDE:
             axis = [row[2] for row in R]
             p = [a + b * (x - joint.rest) for a, b in zip(p, axis, strict=True)]
         else:
-            c, s = cos(x - joint.rest), sin(x - joint.rest)
-            R = [[c * a + s * b, c * b - s * a, z] for a, b, z in R]
+            R = spun(R, x - joint.rest)
             axis = [row[2] for row in R]
         out.append((axis, p))
-    R, p = _offset(R, p, frame.X_end)
+    R, p = offset(R, p, frame.X_end)
     return out, R, p
-
-
-def _offset(R: list[Vector], p: Vector, X: Array) -> tuple[list[Vector], Vector]:
-    X = np.where(np.abs(X) < 1e-13, 0.0, X)
-    near = np.abs(np.abs(X[:3, :3]) - 1.0) < 1e-13
-    X[:3, :3][near] = np.sign(X[:3, :3][near])
-    turned = [[_dot(row, [float(x) for x in X[:3, k]]) for k in range(3)] for row in R]
-    moved = [a + _dot(row, [float(x) for x in X[:3, 3]]) for a, row in zip(p, R, strict=True)]
-    return turned, moved
 
 
 def _free(x: Scalar, g: Scalar, low: float, high: float) -> Scalar:
@@ -172,39 +162,3 @@ def _free(x: Scalar, g: Scalar, low: float, high: float) -> Scalar:
     if np.isfinite(high):
         held = held + (1.0 - less(x, high)) * less(g, 0.0)
     return 1.0 - held
-
-
-def _solve(A: list[Vector], damping: Scalar, b: Vector) -> Vector:
-    """(A + damping I) x = b by the factors L D L^T of the lower triangle A, pivots at least the damping."""
-    n = len(b)
-    L: list[Vector] = [[0.0] * n for _ in range(n)]
-    inverse: Vector = []
-    y = list(b)
-    scaled: list[Vector] = [[0.0] * n for _ in range(n)]
-    for i in range(n):
-        for k in range(i):
-            v = A[i][k] - _total(L[k][m] * scaled[i][m] for m in range(k))
-            scaled[i][k] = v
-            L[i][k] = v * inverse[k]
-        pivot = A[i][i] + damping - _total(L[i][m] * scaled[i][m] for m in range(i))
-        inverse.append(1.0 / maximum(pivot, damping))
-        y[i] = y[i] - _total(L[i][m] * y[m] for m in range(i))
-    x = [v * w for v, w in zip(y, inverse, strict=True)]
-    for i in reversed(range(n)):
-        x[i] = x[i] - _total(L[m][i] * x[m] for m in range(i + 1, n))
-    return x
-
-
-def _dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
-    return _total(x * y for x, y in zip(a, b, strict=True))
-
-
-def _total(xs) -> Scalar:  # type: ignore[no-untyped-def]
-    out: Scalar = 0.0
-    for x in xs:
-        out = out + x
-    return out
-
-
-def _cross(a: Sequence[Scalar], b: Sequence[Scalar]) -> Vector:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..chains.machine import Prepared
 from ..goals import Rows
 from ..problem import Problem
 
@@ -31,9 +32,25 @@ def descend(problem: Problem, q: Array, *, iterations: int = 100, first: bool = 
 
     The damping follows the cost (Fan & Yuan 2005: local convergence stays fast where the Jacobian loses
     rank). Stops when all rows have met their goals or stalled; with `first`, as soon as one has met them.
+    The same in machine code where the problem has some.
     """
+    quick, q = problem.prepared(build=True), problem.space.clip(q)
+    if quick is not None:
+        return _compiled(problem, quick, q, iterations, first)
+    return _descend(problem, q, iterations, first)
+
+
+def _compiled(problem: Problem, quick: Prepared, q: Array, iterations: int, first: bool) -> Descent:
+    ends = quick.machine.descend(q, quick.a, iterations=iterations, first=first)
+    r = problem.raw(ends.q).r
+    met = problem.met(r)
+    if first and met.any():  # what would have met the goals when the quickest did
+        met &= ends.iterations <= ends.iterations[met].min()
+    return Descent(ends.q, r, ends.cost, int(ends.iterations.max(initial=0)), met)
+
+
+def _descend(problem: Problem, q: Array, iterations: int, first: bool) -> Descent:
     space, n = problem.space, len(q)
-    q = space.clip(q)
     raw = problem.raw(q)
     w = problem.weighted(raw)
     cost = _square(w.r)

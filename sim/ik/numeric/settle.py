@@ -18,6 +18,8 @@ from .qp import minimise
 Array = NDArray[np.float64]
 Wish = Callable[[Array], Rows]  # q (n, nq) -> weighted rows to make small
 
+_REST = 1e-10  # longest entry of a step that counts as none
+
 
 class Settled(NamedTuple):
     """Configuration (nq,), value of the wishes there, iterations."""
@@ -30,31 +32,63 @@ class Settled(NamedTuple):
 def settle(problem: Problem, q: Array, wish: Wish, *, iterations: int = 60) -> Settled:
     """Least squares of `wish` from q (nq,), which meets `problem`, along its self-motions inside the limits.
 
-    Each step is a quadratic programme in the null space of the hard rows, followed by a return onto them;
-    a step that does not help is cut (sequential quadratic programming on the constraint manifold).
+    Each step is a quadratic programme in the null space of the hard rows, followed by a return onto them
+    (sequential quadratic programming on the constraint manifold); the last two tell how much of it to take,
+    and a step that does not help is cut.
     """
     x, cap, done = q[None], 0.5, 0
     rows = wish(x)
     value = float(np.sum(rows.r**2))
+    before: Array | None = None
+    share = 1.0
     for done in range(1, iterations + 1):  # noqa: B007
         step = _step(problem, x, rows, cap)
-        if step is None or np.abs(step).max() < 1e-10:
+        if step is None or np.abs(step).max() < _REST:
             break
-        trial = _returned(problem, problem.space.step(x, step[None]))
-        lower = np.inf
-        if trial is not None:
-            rows_trial = wish(trial)
-            lower = float(np.sum(rows_trial.r**2))
-        if trial is None or lower >= value:
-            cap = 0.25 * min(cap, float(np.abs(step).max()))
-            if cap < 1e-9:
+        share = 1.0 if before is None else _share(share, before, step)
+        smaller = [min(share, 1.0) * 0.5**k for k in range(5)]
+        for part in [share, *smaller] if share > 1.0 else smaller:
+            trial = _returned(problem, problem.space.step(x, part * step[None]))
+            rows_trial = None if trial is None else wish(trial)
+            lower = np.inf if rows_trial is None else float(np.sum(rows_trial.r**2))
+            if lower < value:
+                break
+        if trial is None or rows_trial is None or lower >= value:
+            cap, before = 0.25 * min(cap, float(np.abs(step).max())), None
+            if cap < 1e-8:
                 break
             continue
-        gain = value - lower
-        x, rows, value, cap = trial, rows_trial, lower, min(2 * cap, 1.0)
-        if gain < 1e-14 * max(value, 1e-12):
-            break
+        x, rows, value, cap, before, share = trial, rows_trial, lower, min(2 * cap, 1.0), step, part
     return Settled(x[0], value, done)
+
+
+def _share(share: float, before: Array, step: Array) -> float:
+    """What to take of a step after `share` of the one before (Barzilai & Borwein 1988; see `iteration`)."""
+    square = float(before @ before)
+    change = square - float(before @ step)
+    return float(np.clip(share * square / change, 0.1, 8.0)) if change > 1e-6 * square else 1.0
+
+
+def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: float) -> list[Settled]:
+    """`settle` from each row of q (k, nq) for the wishes of the problem and nearness to `start` (nq,).
+
+    `wish` are their rows, those of nearness `faint` times the distance. In machine code where the problem has
+    some, and where that has come to rest at what meets the goals and serves the wishes better than q.
+    """
+    quick = problem.prepared(build=True)
+    if quick is None or not quick.machine.layout.along:
+        return [settle(problem, x, wish) for x in q]
+    machine = quick.machine
+    first = np.sum(wish(q).r ** 2, axis=1)
+    far = machine.settle(q, machine.arguments(problem, q0=start, s=faint**2))
+    end = descend(problem, far.q, iterations=8)
+    last = np.sum(wish(end.q).r ** 2, axis=1)
+    rest = far.step < (_REST if problem.wished is None else _REST / faint)
+    fine = rest & end.met & (far.worst < 1e-2) & (last <= first * (1 + 1e-9) + 1e-12)
+    return [
+        Settled(end.q[i], float(last[i]), int(far.iterations[i])) if fine[i] else settle(problem, q[i], wish)
+        for i in range(len(q))
+    ]
 
 
 def _returned(problem: Problem, q: Array) -> Array | None:
