@@ -6,7 +6,9 @@ difference equation backwards along them (B. D. O. Anderson, J. B. Moore, Optima
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -19,9 +21,23 @@ from .design.linear import held_matrices, linearise_path
 from .design.riccati import along, dlqr
 from .gains import Gain, force_limits, per_joint
 from .nominal import Nominal, difference
-from .preview import Preview
+from .preview import Preview, aimed
 
 Array = NDArray[np.float64]
+
+
+class Solution(NamedTuple):
+    """Regulation of every tick, of one for keys that rest, by freedoms that are not keyed, n, and inputs, m.
+
+    A (ticks, 2 n, 2 n) and B (ticks, 2 n, m) over a period; K (ticks, m, 2 n); P (ticks + 1, 2 n, 2 n): the
+    cost to come; u (ticks, m): the forces that the keys need.
+    """
+
+    A: Array
+    B: Array
+    K: Array
+    P: Array
+    u: Array
 
 
 class LQR:
@@ -29,8 +45,9 @@ class LQR:
 
     Cost per second: ``position`` |q - q_d|^2 + ``velocity`` |v - v_d|^2 + ``force`` |u - u_d|^2, weights one
     number or one a joint by name. ``force`` defaults to 1 / f^2 with f what the joint's drive can give, or
-    its weight at ``q0`` where it can give anything. The gains are those of forces held over ``period`` [s],
-    and are computed when first used.
+    its weight at ``q0`` where it can give anything. Joints without keys are kept at ``goal`` (joint ->
+    value), or where they start. The gains are those of forces held over ``period`` [s], and are computed
+    when first used.
     """
 
     def __init__(
@@ -46,8 +63,10 @@ class LQR:
         position: Gain = 400.0,
         velocity: Gain = 1.0,
         force: Gain | None = None,
+        goal: Mapping[str, float] | None = None,
     ) -> None:
         self.model, self.tracked, self.keyed = model, tracked, keyed
+        clip, self.unkeyed = aimed(clip, goal or {}, "the LQR's goal")
         self.period, self.preview = period, Preview(clip, period, duration)
         self.nominal = Nominal(model)
         moving = ~keyed
@@ -68,8 +87,8 @@ class LQR:
         self.R = np.diag(weights[tracked]) * period
 
     @cached_property
-    def gains(self) -> Array:
-        """K (ticks, nv, 2 nv), or (1, nv, 2 nv) for keys that rest; zero where nothing is driven or seen."""
+    def solution(self) -> Solution:
+        """The regulation along the keys."""
         path = self.preview.targets
         rest = not path.v.any() and np.ptp(path.q, axis=0).max(initial=0.0) == 0.0
         q, v, a = (x[-1:] if rest else x for x in path)
@@ -77,19 +96,33 @@ class LQR:
         continuous = linearise_path(self.nominal, q, v, a, tau, inputs=self.tracked, keyed=self.keyed)
         A, B = held_matrices(*continuous, self.period)
         last = dlqr(A[-1], B[-1], self.Q, self.R)
-        K = last.K[None] if rest else along(A, B, self.Q, self.R, last.P)[0]
+        if rest:
+            return Solution(A, B, last.K[None], np.array([last.P, last.P]), tau[:, self.tracked])
+        return Solution(A, B, *along(A, B, self.Q, self.R, last.P), tau[:, self.tracked])
+
+    @cached_property
+    def gains(self) -> Array:
+        """K (ticks, nv, 2 nv), or (1, nv, 2 nv) for keys that rest; zero where nothing is driven or seen."""
+        K = self.solution.K
         out = np.zeros((len(K), self.model.nv, 2 * self.model.nv))
         seen = np.concatenate([~self.keyed, ~self.keyed])
         out[np.ix_(np.arange(len(K)), self.tracked, seen)] = K
         return out
+
+    def tick(self, t: float) -> int:
+        """Row of the solution at time ``t`` [s]."""
+        return min(max(round(t / self.period), 0), len(self.solution.K) - 1)
+
+    def aim(self, t: float, q: Array, v: Array, target: Target) -> tuple[Array, Array]:
+        """The way (2 nv,) from state q, v to where it belongs, and the joint forces (nv,) that keys need."""
+        target = target._replace(q=np.where(self.unkeyed, self.preview.clip.q0, target.q))
+        error = np.concatenate([difference(self.model, q, target.q), target.v - v])
+        return error, self.nominal.inverse(*self.preview.at(t, target))
 
     def start(self) -> None:
         """No memory."""
 
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
-        tick = min(max(round(t / self.period), 0), len(self.gains) - 1)
-        wanted = self.preview.at(t, target)
-        error = np.concatenate([difference(self.model, q, target.q), target.v - v])
-        tau = self.nominal.inverse(*wanted) + self.gains[tick] @ error
-        return np.where(self.tracked, tau, 0.0), None
+        error, needed = self.aim(t, q, v, target)
+        return np.where(self.tracked, needed + self.gains[self.tick(t)] @ error, 0.0), None

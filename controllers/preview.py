@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models import joint_names
 from ..sim.clip import Clip
 from ..sim.control import Target
+from ..sim.errors import PantographError, unknown
+from ..sim.kinds import SCALAR
 from .nominal import moved
 
 Array = NDArray[np.float64]
@@ -52,3 +56,19 @@ class Preview:
             return Target(*self.clip.evaluate(t + self.offset * self.period))
         q, v, a = self.targets
         return Target(q[k], v[k], a[k])
+
+
+def aimed(clip: Clip, goal: Mapping[str, float], what: str) -> tuple[Clip, NDArray[np.bool_]]:
+    """``clip`` with joints that have no keys at ``goal`` (joint -> value), and the mask (nq,) of these.
+
+    Raises PantographError, saying ``what`` it is about, for names that are no hinge or slide, or have keys.
+    """
+    model, q0, mask = clip.model, clip.q0.copy(), np.zeros(clip.model.nq, dtype=bool)
+    names = joint_names(model)
+    free = [n for j, n in enumerate(names) if model.jnt_type[j] in SCALAR and n not in clip.tracks]
+    for name, value in goal.items():
+        if name not in free:
+            raise PantographError(f"{what}: {unknown('joint without keys', name, free)}")
+        at = model.jnt_qposadr[names.index(name)]
+        q0[at], mask[at] = value, True
+    return Clip(model, clip.tracks, q0), mask

@@ -33,10 +33,11 @@ LAWS: dict[str, Callable[[], Callable[..., Law]]] = {
     "impedance": _law("impedance", "Impedance"),
     "lqr": _law("lqr", "LQR"),
     "swing-up": _law("swing_up", "SwingUp"),
+    "mpc": _law("predictive.linear", "MPC"),
     "nmpc": _law("predictive.nonlinear", "NMPC"),
 }
 
-_FAR_SEEING = ("nmpc",)
+_FAR_SEEING = ("mpc", "nmpc")
 
 
 def make_law(

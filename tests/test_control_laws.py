@@ -18,7 +18,6 @@ from pantograph.controllers.reality import Loop
 from pantograph.controllers.task import Task
 from pantograph.models import load_model
 from pantograph.sim import Scene, SceneError, make_plan, run
-from pantograph.sim.clip import Clip
 from pantograph.sim.compose import LAWS, make_law
 from pantograph.sim.control import Target
 from pantograph.sim.curves import keyed
@@ -349,14 +348,9 @@ def test_lqr_holds_an_unstable_state_and_follows_keys():
         roles={"tracked": ["slide"]},
         keys=[{"joint": "slide", "times": [0], "values": [0]}],
         initial={"position": {"hinge": 0.2, "slide": 0.1}},
-        controller={"law": "lqr", "period": 0.01},
+        controller={"law": "lqr", "period": 0.01, "goal": {"hinge": 0.0}},
     )
-    # the passive pole's target is where it starts: upright is meant
-    plan = make_plan(scene)
-    clip = Clip(plan.problem.model, plan.problem.clip.tracks, np.zeros(2))
-    problem = dataclasses.replace(plan.problem, clip=clip)
-    segment = ContactEngine().run(problem, (0.0, 6.0), _sampled("lqr", problem, period=0.01))
-    assert np.abs(segment.q[-1]).max() < 1e-3
+    assert np.abs(run(scene).q[-1]).max() < 1e-3
     assert worst_error(arm_scene("lqr", 5)) < 1e-4
 
 
@@ -384,6 +378,8 @@ def test_learning_removes_what_the_model_does_not_know():
         ("operational-space", {}, "site = one of tip"),
         ("impedance", {"site": "top"}, "no site 'top'"),
         ("lqr", {"force": 0.0}, "must cost something"),
+        ("lqr", {"goal": {"waist": 0.0}}, "no joint without keys 'waist'"),
+        ("mpc", {"horizon": 0.0}, "horizon must be a positive"),
         ("pd", {"observer": "eyes"}, "no observer 'eyes'"),
         ("pd", {"detay": 1}, "did you mean 'delay'"),
     ],
