@@ -16,6 +16,7 @@ from .engines.smooth import adaptive_methods
 from .engines.smooth import methods as smooth_methods
 from .engines.touch import can_touch
 from .errors import SceneError, unknown
+from .kinds import SLIDE
 from .scene.build import Setup, resolve
 from .scene.live import samples
 from .scene.mistakes import Mistake, SceneMistakes, report
@@ -134,11 +135,19 @@ def _goals(setup: Setup, period: float | None) -> list[tuple[str, Choice]]:
             every = "tick by tick before the run, for nothing is left to physics"
             if setup.live is not None and period:
                 every = f"every {period * samples(period):g} s"
-            moving = [int(j) for j in setup.goals.live_joints]
-            v = max(float(setup.goals.velocity[setup.model.dof_jntid == j].max()) for j in moving)
-            a = max(float(setup.goals.acceleration[setup.model.dof_jntid == j].max()) for j in moving)
-            how = f"live, {every}, joints up to {v:.3g} rad/s (m/s) and {a:.3g} rad/s^2 (m/s^2)"
+            how = f"live, {every}; {', '.join(_most(setup))}"
         out.append((name, Choice(how, why)))
+    return out
+
+
+def _most(setup: Setup) -> list[str]:
+    """Limits of the joints that follow live goals, turning and sliding ones."""
+    m, goals, out = setup.model, setup.goals, []
+    for unit, slides in (("rad", False), ("m", True)):
+        mask = np.isin(m.dof_jntid, [j for j in goals.live_joints if (m.jnt_type[j] == SLIDE) == slides])
+        if mask.any():
+            v, a = float(goals.velocity[mask].max()), float(goals.acceleration[mask].max())
+            out.append(f"joints up to {v:.3g} {unit}/s and {a:.3g} {unit}/s^2")
     return out
 
 
@@ -192,8 +201,10 @@ def _misfits(setup: Setup) -> list[Mistake]:
                 f"{scene.solver.integrator!r} belongs to the smooth engine, which cannot run this scene: "
             )
             mistakes.append(Mistake(("solver", "integrator"), message + "; ".join(reasons)))
-        if scene.solver.tolerance is not None and (why := _why_not_adaptive(setup, engine, reasons)):
-            mistakes.append(Mistake(("solver", "tolerance"), f"adaptive steps are not to be had here: {why}"))
+        if scene.solver.tolerance is not None and (engine == "contact" or reasons):
+            why = "the contact engine, which runs this scene, steps at a fixed rate"
+            why += f", and not the smooth one, since {reasons[0]}" if engine != "contact" else ""
+            mistakes.append(Mistake(("solver", "tolerance"), f"{why}; use 'step'"))
     if step != "auto" and period is not None and free and not _whole(period / step):
         tries = sorted({period / max(1, np.floor(period / step)), period / np.ceil(period / step)})
         message = (
@@ -231,8 +242,6 @@ def why_not_smooth(setup: Setup, touch: bool) -> list[str]:
     reasons = []
     if touch:
         reasons.append('bodies can touch (physics.contacts = "none" leaves that out)')
-    if setup.wrenches:
-        reasons.append("forces act on bodies")
     if m.tendon_limited.any() and setup.scene.physics.limits:
         reasons.append("tendons have limits (physics.limits = false leaves them out)")
     fastest, step = fastest_rate(setup), setup.scene.solver.step
@@ -242,16 +251,6 @@ def why_not_smooth(setup: Setup, touch: bool) -> list[str]:
             f"servos or springs at {fastest:.3g} rad/s are stiff for an explicit method at a step of {h:g} s"
         )
     return reasons + unsupported(m, keyed=np.flatnonzero(setup.roles == Role.KEYED).tolist())
-
-
-def _why_not_adaptive(setup: Setup, engine: str, reasons: list[str]) -> str:
-    if engine == "contact" or reasons:
-        return "the contact engine steps at a fixed rate; use 'step'"
-    if _period(setup) is not None or setup.servo or (setup.roles == Role.KEYED).any():
-        return "controllers, servos and keyed joints are sampled on a grid; use 'step'"
-    if setup.model.jnt_limited.any() and setup.scene.physics.limits:
-        return "joint limits are located between fixed steps; use 'step', or physics.limits = false"
-    return ""
 
 
 def _engine(setup: Setup, touch: bool) -> Choice:

@@ -203,7 +203,7 @@ class Follower:
         Where it runs away, as past a singularity, joints that waited for it could not stand in for slow ones.
         """
         calm = np.abs(moved) <= _CALM * self.v_max
-        near = np.abs(gap) <= np.where(np.isfinite(a), 0.5 * self.v_max**2 / a, np.inf)
+        near = 2 * np.where(np.isfinite(a), a, 0.0) * np.abs(gap) <= self.v_max**2  # way to brake in
         return bool((np.abs(moved) <= self.v_max).all() and (calm.all() or near.all()))
 
     def _seek(self, problem: Problem) -> tuple[Array, Array, Array]:

@@ -30,6 +30,7 @@ from .schema import GoalItem, Scene
 
 Array = NDArray[np.float64]
 _RATE = 60.0  # [1/s] instants at which goals are met exactly; splines between them
+_MET = 1e-6  # [m or rad]
 _DEFAULTS = {"velocity": (1.0, np.pi), "acceleration": (10.0, 6 * np.pi)}  # of live goals: slides, turns
 
 
@@ -247,10 +248,16 @@ def sentences(missed: Mapping[str, Array], t: Array) -> list[str]:
     out = []
     for label, rows in missed.items():
         k = int(np.argmax(rows.sum(axis=1)))
-        far = " and ".join(
-            f"{x:.3g} {unit}" for x, unit in zip(rows[k], ("m", "rad"), strict=True) if x > 1e-6
-        )
-        out.append(
-            f"goal {label!r} is missed by {far} at t = {t[k]:.3g} s" if far else f"goal {label!r} is met"
-        )
+        if rows[k].max() <= _MET:
+            out.append(f"goal {label!r} is met")
+        else:
+            usual = _sizes(np.median(rows, axis=0)) or f"less than {_MET:g}"
+            out.append(
+                f"goal {label!r} is missed by {_sizes(rows[k])} at t = {t[k]:.3g} s, "
+                f"half of the time by {usual} at most"
+            )
     return out
+
+
+def _sizes(row: Array) -> str:
+    return " and ".join(f"{x:.3g} {unit}" for x, unit in zip(row, ("m", "rad"), strict=True) if x > _MET)
