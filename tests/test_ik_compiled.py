@@ -78,6 +78,8 @@ def test_programs_of_goals_compute_their_rows(model, seed):
         Pose(a, x, quat, relative_to="s0"), Orientation(b, quat, relative_to=a),
         LookAt(a, 5 * x, axis=y), PointOnLine(a, x, y), PointOnPlane(a, x, y), Distance(a, 3 * x, 1.0),
         Distance(a, b, 0.5), Posture(q[1]), Mirror(a, "s0", y, x, relative_to=b), Pole(a, "s0", b, x),
+        LookAt(a, 5 * x, axis=y, relative_to=b), Mirror(a, b, y, x, what="pose", flip=y[::-1]),
+        Mirror(b, a, y, relative_to="s0", what="orientation"),
     ]  # fmt: skip
     names = [model.joint(j).name for j in range(model.njnt)]
     by_kind = {k: [names[j] for j in np.flatnonzero(model.jnt_type == k)] for k in (1, 2, 3)}

@@ -56,6 +56,9 @@ class Space:
                 self.shifts.append((q, v))
                 self.balls.append(Ball(q + 3, v + 3, np.inf))
         self.scalar_q, self.scalar_v = np.array(scalar_q, dtype=int), np.array(scalar_v, dtype=int)
+        self.quats = np.array([range(b.q, b.q + 4) for b in self.balls], dtype=int).reshape(-1, 4)
+        self.turns = np.array([range(b.v, b.v + 3) for b in self.balls], dtype=int).reshape(-1, 3)
+        self.cones = np.array([b.limit for b in self.balls])  # [rad], infinite without a limit
         self.q_of_v = np.full(self.nv, -1)
         self.q_of_v[self.scalar_v] = self.scalar_q
 
@@ -82,9 +85,8 @@ class Space:
         out[:, self.scalar_q] += d[:, self.scalar_v]
         for i, v in self.shifts:
             out[:, i : i + 3] += d[:, v : v + 3]
-        for ball in self.balls:
-            quat = slice(ball.q, ball.q + 4)
-            out[:, quat] = rotations.multiply(q[:, quat], rotations.exp(d[:, ball.v : ball.v + 3]))
+        if self.balls:
+            out[:, self.quats] = rotations.multiply(q[:, self.quats], rotations.exp(d[:, self.turns]))
         return self.clip(out)
 
     def clip(self, q: Array) -> Array:
@@ -92,16 +94,19 @@ class Space:
         out = q.copy()
         v = self.scalar_v
         out[:, self.scalar_q] = np.clip(q[:, self.scalar_q], self.low[v], self.high[v])
-        for ball in self.balls:
-            quat = slice(ball.q, ball.q + 4)
-            length = np.linalg.norm(q[:, quat], axis=1, keepdims=True)
-            unit = np.where(length > 0, q[:, quat] / np.maximum(length, 1e-300), [1.0, 0.0, 0.0, 0.0])
-            if np.isfinite(ball.limit):
-                phi = rotations.log(unit)
-                angle = np.linalg.norm(phi, axis=1)
-                inside = rotations.exp(phi * (ball.limit / np.maximum(angle, 1e-300))[:, None])
-                unit = np.where((angle > ball.limit)[:, None], inside, unit)
-            out[:, quat] = unit
+        if not self.balls:
+            return out
+        quat = q[:, self.quats]
+        length = np.linalg.norm(quat, axis=-1, keepdims=True)
+        unit = np.where(length > 0, quat / np.maximum(length, 1e-300), [1.0, 0.0, 0.0, 0.0])
+        if np.isfinite(self.cones).any():
+            phi = rotations.log(unit)
+            angle = np.linalg.norm(phi, axis=-1)
+            over = angle > self.cones
+            if over.any():
+                share = np.where(over, self.cones, 1.0) / np.maximum(angle, 1e-300)
+                unit = np.where(over[..., None], rotations.exp(phi * share[..., None]), unit)
+        out[:, self.quats] = unit
         return out
 
     def difference(self, to: Array, start: Array) -> Array:
@@ -111,10 +116,9 @@ class Space:
         d[:, self.scalar_v] = to[:, self.scalar_q] - start[:, self.scalar_q]
         for i, v in self.shifts:
             d[:, v : v + 3] = to[:, i : i + 3] - start[:, i : i + 3]
-        for ball in self.balls:
-            quat = slice(ball.q, ball.q + 4)
-            turn = rotations.multiply(rotations.conjugate(start[:, quat]), to[:, quat])
-            d[:, ball.v : ball.v + 3] = rotations.log(turn)
+        if self.balls:
+            turn = rotations.multiply(rotations.conjugate(start[:, self.quats]), to[:, self.quats])
+            d[:, self.turns] = rotations.log(turn)
         return d
 
     def free_directions(self, q: Array, g: Array) -> tuple[NDArray[np.bool_], list[tuple[Ball, Array]]]:
@@ -178,14 +182,13 @@ class Space:
 
     def nearest_turns(self, q: Array, to: Array) -> Array:
         """`q` (n, nq) with whole turns of hinges chosen: as near to `to` as the limits allow."""
-        out = q.copy()
-        turn = 2 * np.pi
-        for v in self.hinges:
-            i = self.q_of_v[v]
-            near = q[:, i] - turn * np.round((q[:, i] - to[..., i]) / turn)
-            near = np.where(near > self.high[v], near - turn, near)
-            near = np.where(near < self.low[v], near + turn, near)
-            out[:, i] = np.where((near <= self.high[v]) & (near >= self.low[v]), near, q[:, i])
+        out, turn = q.copy(), 2 * np.pi
+        v, i = self.hinges, self.q_of_v[self.hinges]
+        low, high = self.low[v], self.high[v]
+        near = q[:, i] - turn * np.round((q[:, i] - to[..., i]) / turn)
+        near = np.where(near > high, near - turn, near)
+        near = np.where(near < low, near + turn, near)
+        out[:, i] = np.where((near <= high) & (near >= low), near, q[:, i])
         return out
 
     def excess(self, q: Array) -> Array:

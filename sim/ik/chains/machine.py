@@ -19,7 +19,7 @@ from ...compile.kernels import kernel
 from ...compile.llvm import Emitter, declarations
 from ...compile.loops import Block, declare, function, map_function
 from ...compile.program import address, facts_of, obtain
-from ..goals import Rows
+from ..goals import Goal, Rows
 from .iteration import Layout, arguments, iteration_tape, layout, rows_tape
 from .rows import expressible
 
@@ -288,13 +288,17 @@ def structure(problem: Problem) -> str | None:
     ]  # fmt: skip
     wished = problem.wished
     arrays += [] if wished is None else [np.isfinite(wished.tolerance), wished.band > 0]
-    goals = [
-        (type(g).__name__, g.frames(), *(getattr(g, x, None) for x in ("relative_to", "joint", "joints")))
-        for g in (*problem.goals, *(() if wished is None else wished.goals))
-    ]
+    goals = [_words(g) for g in (*problem.goals, *(() if wished is None else wished.goals))]
     loops = [(loop.label, loop.a, loop.b) for loop in problem.loops]
     words = repr((len(problem.goals), goals, loops, model.nq, model.nv, _source()))
     return key_of(words, model.names, *(np.ascontiguousarray(x).tobytes() for x in arrays))
+
+
+def _words(goal: Goal) -> list[str | tuple[str, ...]]:
+    """A goal without its numbers: its kind, and the names it gives in order."""
+    own = [getattr(goal, key) for key in goal.__dataclass_fields__ if key != "name"]
+    names = [x for x in own if isinstance(x, str) or (isinstance(x, tuple) and x and isinstance(x[0], str))]
+    return [type(goal).__name__, *("-" if x is None else "." for x in own), *names]
 
 
 class _Absent(Exception):

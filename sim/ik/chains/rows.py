@@ -161,12 +161,17 @@ def _pose(scene: Scene, goal: Pose, t: Vector) -> list[Row]:
 
 def _look_at(scene: Scene, goal: LookAt, t: Vector) -> list[Row]:
     f = scene.frame(goal.at)
-    a, sight = times(f.R, t[3:6]), minus(t[:3], f.p)
+    a, target, J = times(f.R, t[3:6]), t[:3], {v: [-x for x in u] for v, u in f.u.items()}
+    if goal.relative_to is not None:
+        b = scene.frame(goal.relative_to)
+        arm = times(b.R, target)
+        target = plus(b.p, arm)
+        J = _together(_together(J, b.u), {v: cross(w, arm) for v, w in b.w.items()})
+    sight = minus(target, f.p)
     inverse = 1.0 / maximum(sqrt(dot(sight, sight)), 1e-9)
     d = scaled(inverse, sight)
-    J = {v: cross(w, a) for v, w in f.w.items()}
-    swept = {v: scaled(inverse, minus(u, scaled(dot(d, u), d))) for v, u in f.u.items()}
-    return _rows(minus(a, d), _together(J, swept))
+    swept = {v: scaled(inverse, minus(u, scaled(dot(d, u), d))) for v, u in J.items()}
+    return _rows(minus(a, d), _together({v: cross(w, a) for v, w in f.w.items()}, swept, -1.0))
 
 
 def _on_line(scene: Scene, goal: PointOnLine, t: Vector) -> list[Row]:
@@ -193,13 +198,19 @@ def _distance(scene: Scene, goal: Distance, t: Vector) -> list[Row]:
 
 def _mirror(scene: Scene, goal: Mirror, t: Vector) -> list[Row]:
     f, g = (scene.seen_from(at, goal.relative_to) for at in (goal.at, goal.of))
-    n, point = t[:3], t[3:6]
+    n, point, flip = t[:3], t[3:6], t[6:9]
 
-    def reflected(x: Vector) -> Vector:
-        return minus(x, scaled(2.0 * dot(n, x), n))
+    def reflected(x: Vector, along: Vector = n) -> Vector:
+        return minus(x, scaled(2.0 * dot(along, x), along))
 
     image = plus(reflected(minus(g.p, point)), point)
-    return _rows(minus(f.p, image), _together(f.u, {v: reflected(x) for v, x in g.u.items()}, -1.0))
+    place = _rows(minus(f.p, image), _together(f.u, {v: reflected(x) for v, x in g.u.items()}, -1.0))
+    if goal.what == "position":
+        return place
+    back = [reflected(column) for column in transposed([reflected(row, flip) for row in g.R])]
+    turns = _together(f.w, {v: reflected(x) for v, x in g.w.items()})
+    turn = _turn(Seen(f.R, f.p, turns, {}), back)
+    return turn if goal.what == "orientation" else place + turn
 
 
 def _center(scene: Scene, goal: CenterOfMass, t: Vector) -> list[Row]:
@@ -347,7 +358,7 @@ def _known() -> dict[type, tuple[Callable[[Any], Array], Callable[[Scene, Any, V
         ),
         PointOnPlane: (lambda g: _flat(g.point, g.normal), _on_plane),
         Distance: (lambda g: _flat(g.distance, np.zeros(3) if isinstance(g.to, str) else g.to), _distance),
-        Mirror: (lambda g: _flat(g.normal, g.point), _mirror),
+        Mirror: (lambda g: _flat(g.normal, g.point, g.flip), _mirror),
         CenterOfMass: (lambda g: _flat(g.target), _center),
         JointValue: (lambda g: _flat(g.value), _joint_value),
         Posture: (lambda g: _flat(g.q), _posture),
