@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.sim.compile import graph as g
+from pantograph.sim.compile import kernels
 from pantograph.sim.compile import llvm as emission
 from pantograph.sim.compile.cache import Cache, default_folder, key_of, pack, unpack
 from pantograph.sim.compile.diff import directional, gradient
@@ -190,7 +191,7 @@ def test_a_long_tape_cut_into_pieces_computes_the_same(monkeypatch):
         values.append(apply(SMOOTH[rng.integers(len(SMOOTH))], a, g.sin(b)))
     tape = Tape.build({"x": 3}, {"y": [values[i] for i in rng.integers(0, len(values), 30)]})
     whole = compiled(tape, 4)([points(0, 9)], 9, 1)[0]
-    monkeypatch.setattr(emission, "CHUNK", 37)
+    monkeypatch.setattr(kernels, "CHUNK", 37)
     assert "@f.4(" in map_source(tape, 4)[0]
     np.testing.assert_allclose(compiled(tape, 4)([points(0, 9)], 9, 1)[0], whole, rtol=1e-13)
 

@@ -12,7 +12,7 @@ from typing import Any
 from .llvm import Emitter
 from .loops import Block, function
 from .pieces import pieces_function, repeat_while
-from .rollout import CONTROL_ARGUMENTS, Control, Shape, advance, combine, normalize, splat
+from .rollout import CONTROL_ARGUMENTS, Control, Shape, advance, combine, normalize
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 8.0
 OK, TOO_MANY_STEPS, STEP_TOO_SMALL, GUARDED = 0.0, 1.0, 2.0, 4.0
@@ -161,8 +161,8 @@ class _Integrator:
                     estimate = e.f("fadd", estimate, part)
             old, new = e.call("fabs", e.load(self.X, i)), e.call("fabs", e.load(self.XN, i))
             size = e.select(e.compare("ogt", old, new), old, new)
-            atol = splat(e, e.emit(f"load double, ptr {e.element('%atol', i, 'double')}, align 8"))
-            scale = e.f("fadd", atol, e.f("fmul", splat(e, "%rtol"), size))
+            atol = e.splat(e.emit(f"load double, ptr {e.element('%atol', i, 'double')}, align 8"))
+            scale = e.f("fadd", atol, e.f("fmul", e.splat("%rtol"), size))
             unit = e.f("fdiv", e.f("fmul", estimate, h), scale)
             e.store(e.f("fadd", e.load(total, 0), e.f("fmul", unit, unit)), total, 0)
         return e.load(total, 0)
@@ -234,7 +234,7 @@ class _Integrator:
         tiny = e.compare("ole", self.get("want"), e.f("fadd", resolution, e.const(1e-300)))
         tiny = e.emit(f"and {e.B} {tiny}, {reject}")
         done = e.f("fadd", self.get("steps"), self.get("rejected"))
-        many = e.compare("oge", done, splat(e, "%max_steps"))
+        many = e.compare("oge", done, e.splat("%max_steps"))
         status = e.select(many, e.const(TOO_MANY_STEPS), self.get("status"))
         self.set("status", e.select(tiny, e.const(STEP_TOO_SMALL), status))
 
@@ -327,7 +327,7 @@ class _Integrator:
         for slope, pulled in ((self.K[0], True), (self.K[1], False)):
             for k, at in enumerate(self.pulling):
                 entry = s.element("%jumps", s.emit(f"add nsw i64 {row}, {k}"), "double")
-                value = splat(e, s.emit(f"load double, ptr {entry}, align 8")) if pulled else e.const(0.0)
+                value = e.splat(s.emit(f"load double, ptr {entry}, align 8")) if pulled else e.const(0.0)
                 e.store(value, self.W, at)
             self.evaluate(self.X, slope)
         sound = e.compare("oeq", self.get("status"), e.const(OK))
@@ -396,7 +396,7 @@ class _Integrator:
                 e.do(f"store i64 {row}, ptr {e.element(self.row, lane, 'i64')}, align 8")
                 e.do(f"store i64 %first_eval, ptr {e.element(self.index, lane, 'i64')}, align 8")
                 e.do(f"store i64 0, ptr {e.element(self.piece, lane, 'i64')}, align 8")
-            self.set("t", splat(e, "%t0"))
+            self.set("t", e.splat("%t0"))
             for name, value in (("before", 0.0), ("grow", GROW), *((s, 0.0) for s in STATISTICS[:4])):
                 self.set(name, e.const(value))
             sampled = e.slot(1, "i64")
@@ -410,7 +410,7 @@ class _Integrator:
                     with e.when(e.emit(f"icmp sge i64 {jump}, 0")):
                         self.jump(jump)
                 edge = e.emit(f"load double, ptr {e.element('%edges', span, 'double')}, align 8")
-                self.period(splat(e, edge))
+                self.period(e.splat(edge))
             self.output_end()
             block.scatter(self.X, block.pointers("%x1", shape.nx), shape.nx)
             for k, name in enumerate((*STATISTICS[:4], "want", "t")):

@@ -1,4 +1,4 @@
-"""A tape as LLVM IR text: one function over scalars or over short vectors (lanes) of states.
+"""A writer of LLVM IR text, over scalars or over short vectors (lanes) of states.
 
 Sines, cosines and arctangents are our own polynomials (Cody & Waite reduction, Cephes coefficients), so that
 all lanes are computed at once; products and sums may contract into fused operations, nothing else is relaxed.
@@ -7,12 +7,10 @@ all lanes are computed at once; products and sums may contract into fused operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, ROUND, SIN, SQRT, SUB
 from .jit import fused, preferred_lanes
-from .tape import Tape
 
 _SIN = (
     1.58962301576546568060e-10,
@@ -106,7 +104,11 @@ class Emitter:
 
     def const(self, x: float) -> str:
         """A number in all lanes."""
-        return double(x) if self.lanes == 1 else f"<{', '.join([f'double {double(x)}'] * self.lanes)}>"
+        return double(x) if self.lanes == 1 else self.consts([x] * self.lanes)
+
+    def consts(self, xs: Sequence[float]) -> str:
+        """A number in each lane."""
+        return f"<{', '.join(f'double {double(x)}' for x in xs)}>"
 
     def iconst(self, x: int) -> str:
         """An integer in all lanes."""
@@ -243,6 +245,25 @@ class Emitter:
         c = self.bits(self.select(swap, sine, cosine))
         return self.value(self.i("xor", s, sign_s)), self.value(self.i("xor", c, sign_c))
 
+    def splat(self, scalar: str) -> str:
+        """A scalar register in all lanes."""
+        if self.lanes == 1:
+            return scalar
+        one = self.emit(f"insertelement {self.V} poison, double {scalar}, i64 0")
+        zeros = f"<{self.lanes} x i32> zeroinitializer"
+        return self.emit(f"shufflevector {self.V} {one}, {self.V} poison, {zeros}")
+
+    def gathered(self, scalars: Sequence[str]) -> str:
+        """Scalar registers in lanes."""
+        vector = "poison"
+        for lane, x in enumerate(scalars):
+            vector = self.emit(f"insertelement {self.V} {vector}, double {x}, i64 {lane}")
+        return vector
+
+    def lane(self, vector: str, lane: int) -> str:
+        """The scalar in one lane."""
+        return self.emit(f"extractelement {self.V} {vector}, i64 {lane}")
+
     def side_by_side(self, angles: list[str]) -> list[tuple[str, str]]:
         """Sines and cosines of many angles of one state, several in one vector."""
         if self.lanes > 1 or len(angles) == 1:
@@ -252,13 +273,8 @@ class Emitter:
         for first in range(0, len(angles), most):
             group = angles[first : first + most]
             wide = self.sharing(max(2, 1 << (len(group) - 1).bit_length()))
-            vector = "poison"
-            for lane, x in enumerate(group):
-                vector = self.emit(f"insertelement {wide.V} {vector}, double {x}, i64 {lane}")
-            sine, cosine = wide.sincos(vector)
-            for lane in range(len(group)):
-                s, c = (self.emit(f"extractelement {wide.V} {x}, i64 {lane}") for x in (sine, cosine))
-                out.append((s, c))
+            sine, cosine = wide.sincos(wide.gathered(group))
+            out += [(wide.lane(sine, lane), wide.lane(cosine, lane)) for lane in range(len(group))]
         return out
 
     def atan2(self, y: str, x: str) -> str:
@@ -292,144 +308,9 @@ DECLARED = {"sqrt": 1, "fabs": 1, "rint": 1, "copysign": 2, "fma": 3}
 
 def declarations(lanes: int) -> str:
     """Intrinsics that kernels on `lanes` may call; scalar ones use vectors as well (`side_by_side`)."""
-    writers = [Emitter(width) for width in ((1, 2, 4, 8) if lanes == 1 else (lanes,))]
+    writers = [Emitter(width) for width in (range(1, 9) if lanes == 1 else (lanes,))]
     return "\n".join(
         f"declare {e.V} @llvm.{name}.{e.suffix}({', '.join([e.V] * arity)})"
         for e in writers
         for name, arity in DECLARED.items()
     )
-
-
-_BINARY = {ADD: "fadd", SUB: "fsub", MUL: "fmul"}
-
-
-INLINE_COST = 200  # operations up to which a kernel is inlined into its loops
-CHUNK = 3000  # rows of a tape in one function: compile time grows faster than length
-
-
-def kernel(name: str, tape: Tape, lanes: int) -> str:
-    """IR of `tape` as `void name(ptr inputs..., ptr outputs...)`; scalar k of an argument fills lanes k.
-
-    A long tape is cut into functions that hand values on through memory.
-    """
-    arguments = [f"ptr noalias nocapture readonly %in{k}" for k in range(len(tape.inputs))]
-    arguments += [f"ptr noalias nocapture %out{k}" for k in range(len(tape.outputs))]
-    if len(tape.rows) <= CHUNK * 4 // 3:
-        e = Emitter(lanes)
-        _write(e, tape, range(len(tape.rows)), {})
-        return _function(name, arguments, e)
-    chunk_of = _chunks(tape)
-    slots, count = _slots(tape, chunk_of)
-    members: list[list[int]] = [[] for _ in range(max(chunk_of) + 1)]
-    for i, k in enumerate(chunk_of):
-        members[k].append(i)
-    texts, outer = [], Emitter(lanes)
-    work = outer.emit(f"alloca [{max(count, 1)} x {outer.V}], align 64")
-    passed = ", ".join("ptr " + argument.split()[-1] for argument in arguments)
-    for k, rows in enumerate(members):
-        e = Emitter(lanes)
-        _write(e, tape, rows, slots)
-        texts.append(_function(f"{name}.{k}", [*arguments, "ptr noalias nocapture %work"], e))
-        outer.do(f"call void @{name}.{k}({passed}, ptr {work})")
-    return "".join([*texts, _function(name, arguments, outer)])
-
-
-def _function(name: str, arguments: list[str], e: Emitter) -> str:
-    body = "\n".join(e.lines)
-    return f"define void @{name}({', '.join(arguments)}) nounwind {{\n{body}\n  ret void\n}}\n"
-
-
-def _chunks(tape: Tape) -> list[int]:
-    """Chunk of every row; both of a sine-cosine pair belong where the first one is."""
-    chunk_of = [i // CHUNK for i in range(len(tape.rows))]
-    pair: dict[int, int] = {}
-    for i, (op, a, _) in enumerate(tape.rows):
-        if op in (SIN, COS):
-            chunk_of[i] = pair.setdefault(a, chunk_of[i])
-    return chunk_of
-
-
-def _slots(tape: Tape, chunk_of: list[int]) -> tuple[dict[int, int], int]:
-    """Places in shared memory for the values that cross from chunk to chunk, and how many there are."""
-    last: dict[int, int] = {}
-    for i, (op, *operands) in enumerate(tape.rows):
-        for k in () if op in (CONST, INPUT) else operands:
-            if k is not None and tape.rows[k][0] not in (CONST, INPUT) and chunk_of[k] != chunk_of[i]:
-                last[k] = max(last.get(k, 0), chunk_of[i])
-    slots: dict[int, int] = {}
-    free: list[int] = []
-    ends: dict[int, list[int]] = {}
-    count = 0
-    for i in sorted(last, key=lambda i: (chunk_of[i], i)):
-        for chunk in [c for c in ends if c < chunk_of[i]]:
-            free += ends.pop(chunk)
-        if not free:
-            free.append(count)
-            count += 1
-        slots[i] = free.pop()
-        ends.setdefault(last[i], []).append(slots[i])
-    return slots, count
-
-
-def _write(e: Emitter, tape: Tape, rows: Iterable[int], slots: dict[int, int]) -> None:
-    """Instructions of some rows of a tape; values from other chunks come through their slots in %work."""
-    values: dict[int, str] = {}
-    pairs: dict[int, tuple[str, str]] = {}
-
-    def value(i: int) -> str:
-        if i not in values:
-            op, a, b = tape.rows[i]
-            if op == CONST:
-                values[i] = e.const(a)
-            elif op == INPUT:
-                values[i] = e.load(f"%in{a}", b)
-            else:
-                values[i] = e.load("%work", slots[i])
-        return values[i]
-
-    def joint_angles() -> list[int]:
-        angles = (tape.rows[i][1] for i in rows if tape.rows[i][0] in (SIN, COS))
-        return list(dict.fromkeys(a for a in angles if tape.rows[a][0] == INPUT))
-
-    def angle(i: int) -> str:
-        op, argument, index = tape.rows[i]
-        if op != INPUT or e.lanes > 1 or tape.cost <= INLINE_COST:
-            return value(i)
-        # volatile: neighbours loaded as one vector would wait for the stores of its parts to drain
-        return e.emit(f"load volatile double, ptr {e.element(f'%in{argument}', index)}, align 8")
-
-    for i in rows:
-        op, a, b = tape.rows[i]
-        if op in (SIN, COS):
-            if a not in pairs:
-                angles = joint_angles() if tape.rows[a][0] == INPUT else [a]
-                pairs.update(zip(angles, e.side_by_side([angle(k) for k in angles]), strict=True))
-            values[i] = pairs[a][op == COS]
-        elif op not in (CONST, INPUT):
-            values[i] = _operation(e, op, value(a), None if b is None else value(b))
-        if i in slots:
-            e.store(values[i], "%work", slots[i])
-        for k, j in tape.targets.get(i, ()):
-            e.store(value(i), f"%out{k}", j)
-
-
-def _operation(e: Emitter, op: int, a: str, b: str | None) -> str:
-    if op in _BINARY:
-        assert b is not None
-        return e.f(_BINARY[op], a, b)
-    if op == NEG:
-        return e.emit(f"fneg {e.V} {a}")
-    if op == INV:
-        return e.f("fdiv", e.const(1.0), a)
-    if op == SQRT:
-        return e.call("sqrt", a)
-    if op in (ABS, ROUND):
-        return e.call("fabs" if op == ABS else "rint", a)
-    assert b is not None
-    if op == LESS:
-        return e.select(e.compare("olt", a, b), e.const(1.0), e.const(0.0))
-    if op in (MIN, MAX):
-        return e.select(e.compare("olt" if op == MIN else "ogt", a, b), a, b)
-    if op == ATAN2:
-        return e.atan2(a, b)
-    raise ValueError(f"no instruction for operation {op}")

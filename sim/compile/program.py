@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from .cache import Cache
 from .jit import Loaded, compile_ir, load
-from .llvm import INLINE_COST, declarations, kernel
+from .kernels import INLINE_COST, kernel
+from .llvm import declarations
 from .loops import declare, map_function
 from .tape import Tape
 

@@ -91,15 +91,6 @@ def normalize(e: Emitter, x: str, quaternions: tuple[int, ...]) -> None:
             e.store(e.f("fmul", part, scale), x, first + k)
 
 
-def splat(e: Emitter, scalar: str) -> str:
-    """A scalar register in all lanes."""
-    if e.lanes == 1:
-        return scalar
-    one = e.emit(f"insertelement {e.V} poison, double {scalar}, i64 0")
-    zeros = f"<{e.lanes} x i32> zeroinitializer"
-    return e.emit(f"shufflevector {e.V} {one}, {e.V} poison, {zeros}")
-
-
 def live_stages(A: Array, b: Array) -> list[int]:
     """Stages that a step of fixed length needs."""
     needed = {i for i in range(len(b)) if b[i] != 0.0}
@@ -157,7 +148,7 @@ def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:
     X, Y, U, W, P = (e.slot(size) for size in (shape.nx, shape.nx, shape.nu, shape.nw, shape.np))
     used = live_stages(method.A, method.b)
     K = {i: e.slot(shape.nx) for i in used}
-    h = splat(e, "%h")
+    h = e.splat("%h")
     stages = len(method.b)
     total = e.emit("mul nsw i64 %periods, %steps")
     records = e.emit(f"add nsw i64 {e.emit(f'sdiv i64 {total}, %every')}, 1")

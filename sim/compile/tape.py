@@ -57,17 +57,26 @@ class Tape:
     """Program of (op, a, b) rows; a, b are rows, or a constant, or an input's (argument, index).
 
     `inputs` and `outputs` give the size of every argument by name, in the order of the compiled call;
-    `results` gives for every output the rows of its scalars.
+    `results` gives for every output the rows of its scalars. `limbs` are sets of limbs built alike, each limb
+    a list of its inputs (argument, index).
     """
 
     rows: tuple[tuple[int, Any, Any], ...]
     inputs: dict[str, int]
     outputs: dict[str, int]
     results: tuple[tuple[int, ...], ...]
+    limbs: tuple[tuple[tuple[tuple[int, int], ...], ...], ...] = ()
 
     @staticmethod
-    def build(inputs: Mapping[str, int], outputs: Mapping[str, Sequence[Scalar]]) -> Tape:
-        """Tape of the named `outputs`; `inputs` gives names and sizes of the arguments of their graph."""
+    def build(
+        inputs: Mapping[str, int],
+        outputs: Mapping[str, Sequence[Scalar]],
+        limbs: Sequence[Sequence[Sequence[tuple[str, int]]]] = (),
+    ) -> Tape:
+        """Tape of the named `outputs`; `inputs` gives names and sizes of the arguments of their graph.
+
+        `limbs` are sets of limbs, each a list of its inputs (name, index), in the same order in each limb.
+        """
         argument = {name: k for k, name in enumerate(inputs)}
         rows: list[tuple[int, Any, Any]] = []
         place: dict[int, int] = {}
@@ -95,7 +104,11 @@ class Tape:
 
         results = tuple(tuple(result(x) for x in xs) for xs in outputs.values())
         sizes = {name: len(xs) for name, xs in outputs.items()}
-        return Tape(tuple(rows), dict(inputs), sizes, results)
+        alike = tuple(
+            tuple(tuple((argument[name], i) for name, i in limb if name in argument) for limb in each)
+            for each in limbs
+        )
+        return Tape(tuple(rows), dict(inputs), sizes, results, alike)
 
     @cached_property
     def counts(self) -> dict[str, int]:

@@ -230,7 +230,8 @@ def _rate_vjp(eq: Equations, kind: str) -> Tape:
     by = _gradients(
         eq, rows, [*bar[: lay.nq], *weights, *bar[lay.nq + lay.nv : lay.nx]], ("q", "v", "act", "u", "p")
     )
-    return eq.tape("q v act u w p bar", {"x": by["q"] + by["v"] + by["act"], "u": by["u"], "p": by["p"]})
+    outputs = {"x": by["q"] + by["v"] + by["act"], "u": by["u"], "p": by["p"]}
+    return eq.tape("q v act u w p bar", outputs, bar="x")
 
 
 def _gradients(

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compile.cache import key_of
-from ..compile.llvm import declarations, kernel
+from ..compile.kernels import kernel
+from ..compile.llvm import declarations
 from ..compile.loops import declare
 from ..compile.program import Code, facts_of, obtain
 from ..compile.rollout import Shape, live_stages

@@ -11,9 +11,10 @@ from ..compile.graph import Graph, Node, Scalar
 from ..compile.tape import Tape
 from ..errors import EngineError
 from .fields import Fields, Parameter, parameter_index
-from .fluid import applied_wrenches
+from .fluid import applied_wrenches, push_body
 from .forces import actuator_forces, disabled, passive_forces
 from .layout import Layout
+from .limbs import limbs
 from .rigid import spatial
 from .rigid.articulated import articulated_solve
 from .rigid.mass_matrix import Entries, Factor, dense, dof_parents, mass_matrix
@@ -72,7 +73,7 @@ class Equations:
     @cached_property
     def armature(self) -> list[Scalar]:
         """Rotor inertia of every freedom."""
-        return [self.fields.scalar("dof_armature", dof) for dof in range(self.model.nv)]
+        return [self.fields.armature(dof) for dof in range(self.model.nv)]
 
     def _model_coordinates(self) -> tuple[list[Scalar], list[Scalar], list[Scalar]]:
         """qpos, qvel and prescribed accelerations of the whole model."""
@@ -131,7 +132,7 @@ class Equations:
         ctrl: list[Scalar] = [0.0] * self.model.nu
         for actuator, node in zip(lay.u_held, u, strict=False):
             ctrl[actuator] = node
-        for actuator, node in zip(lay.timed, w[lay.nw - len(lay.timed) :], strict=True):
+        for actuator, node in zip(lay.timed, w[lay.w_timed : lay.w_wrenches], strict=True):
             ctrl[actuator] = node
         return actuator_forces(self.fields, self.q, self.v, self.inputs["act"], ctrl)
 
@@ -144,7 +145,12 @@ class Equations:
 
     @cached_property
     def _wrenches(self) -> list[tuple[spatial.Vector, spatial.Vector] | None]:
-        return applied_wrenches(self.fields, self.tree, self.where, self.v, self.gravity)
+        out = applied_wrenches(self.fields, self.tree, self.where, self.v, self.gravity)
+        for k, (body, own_frame) in enumerate(self.layout.wrenches):
+            first = self.layout.w_wrenches + 6 * k
+            part = self.inputs["w"][first : first + 6]
+            push_body(self.fields, self.tree, self.where, body, part[:3], part[3:], out, own_frame=own_frame)
+        return out
 
     def inertial_local(self, a: Sequence[Scalar], gravity: Sequence[spatial.Vector]) -> list[Scalar]:
         """Rigid-body forces at the local accelerations `a` of all freedoms, without armature."""
@@ -250,6 +256,10 @@ class Equations:
             return dict(zip(q[at : at + 4], turning, strict=True))
         raise IndexError(index)
 
-    def tape(self, inputs: str, outputs: Mapping[str, Sequence[Scalar]]) -> Tape:
-        """Program of `outputs` with the arguments named in `inputs` (of q, v, act, u, tau, a, w, p, bar)."""
-        return Tape.build({name: len(self.inputs[name]) for name in inputs.split()}, outputs)
+    def tape(self, inputs: str, outputs: Mapping[str, Sequence[Scalar]], *, bar: str = "v") -> Tape:
+        """Program of `outputs` with the arguments named in `inputs` (of q, v, act, u, tau, a, w, p, bar).
+
+        `bar` says whether the weights of that name belong to freedoms ("v") or to the state ("x").
+        """
+        alike = limbs(self.model, self.tree, self.layout, bar=bar)
+        return Tape.build({name: len(self.inputs[name]) for name in inputs.split()}, outputs, alike)
