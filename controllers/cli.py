@@ -19,8 +19,12 @@ SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked 
 
 def control(
     scene: SceneFile,
-    compare: Annotated[str, typer.Option(help="Laws, separated by commas: pid,computed-torque,lqr.")] = "",
-    sweep: Annotated[list[str] | None, typer.Option(help="Values of a parameter: frequency=2,5,10.")] = None,
+    compare: Annotated[
+        str, typer.Option(help="Laws, separated by commas: pid,computed-torque,lqr,mpc.")
+    ] = "",
+    sweep: Annotated[
+        list[str] | None, typer.Option(help="Values of a parameter: frequency=2,5,10, or one: site=tip.")
+    ] = None,
     trials: Annotated[int, typer.Option(help="Disturbed runs a law.", min=0)] = 8,
     mass: Annotated[float, typer.Option(help="Masses differ by up to this part.", min=0.0)] = 0.1,
     push: Annotated[
@@ -28,13 +32,15 @@ def control(
     ] = 0.2,
     seed: Annotated[int, typer.Option(help="Of the disturbances.")] = 0,
     processes: Annotated[int | None, typer.Option(help="Processes; default: all processors.", min=1)] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the table and the picture.")] = Path("out"),
+    table: Annotated[str, typer.Option(help="Kind of the saved tables: csv or parquet.")] = "csv",
+    out: Annotated[Path, typer.Option(help="Folder for tables and picture.")] = Path("out"),
 ) -> None:
     """Run a scene under several control laws, as modelled and disturbed, and compare them."""
     from ..sim.compose import LAWS
     from ..sim.scene.load import load_scene
-    from . import experiments
+    from . import experiments, tables
 
+    tables.check_format(table)
     loaded = load_scene(scene)
     own = loaded.controller.law if loaded.controller else "pd"
     laws = [law.strip() for law in compare.split(",") if law.strip()] or [own]
@@ -55,10 +61,11 @@ def control(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(*_tables(result), sep="\n")
-    console.print(f"table: {experiments.write_csv(result, out / f'{scene.stem}.control.csv')}")
+    for what, rows in (("control", tables.summary(result)), ("runs", tables.runs(result))):
+        console.print(f"table: {tables.save(rows, out / f'{scene.stem}.{what}.{table}')}", soft_wrap=True)
     picture = out / f"{scene.stem}.control.png"
     experiments.figure(result).savefig(picture, dpi=120)
-    console.print(f"picture: {picture}")
+    console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def _values(text: str) -> tuple[str, list[Any]]:
@@ -81,13 +88,15 @@ def _value(text: str) -> Any:
 def _tables(result: Any) -> tuple[Table, Table]:
     """How well each law follows, and what it takes."""
     count = len(result.disturbances)
-    well = _columns("law", "RMS", "max", f"worst RMS of {count}", "failed", "settling", "overshoot")
-    well.title = "errors over the tracked joints [rad, m], settling [s]"
+    well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
+    well.title = f"errors over the tracked joints (rad, m), settling (s); the worst of {count} disturbed runs"
     cost = _columns("law", "effort", "work J", "saturated", "tick us", "99 % us", "of period")
     cost.title = f"what it takes; period {result.period * 1e3:g} ms"
     for row in result.rows:
         f, name = row.nominal, row.variant.name
-        settled = "never" if math.isnan(f.settling) else f"{f.settling:.3f}"
+        settled = (
+            "-" if math.isnan(f.settling) else "never" if math.isinf(f.settling) else f"{f.settling:.3f}"
+        )
         robust = f"{row.robust:.2e}" if count else "-"
         well.add_row(
             name, f"{f.rms:.2e}", f"{f.worst:.2e}", robust, str(row.failed), settled, f"{f.overshoot:.1%}"
@@ -107,5 +116,8 @@ def _tables(result: Any) -> tuple[Table, Table]:
 def _columns(*heads: str) -> Table:
     table = Table()
     for head in heads:
-        table.add_column(head, justify="left" if head == "law" else "right")
+        if head == "law":
+            table.add_column(head, overflow="fold")
+        else:
+            table.add_column(head, justify="right", no_wrap=True)
     return table

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..models import names_of
 from ..sim.compile.program import workers
-from ..sim.compose import check_law
+from ..sim.compose import check_law, known_words
 from ..sim.engines.interface import Role
 from ..sim.errors import PantographError
 from ..sim.plan import Plan, make_plan
@@ -86,9 +85,10 @@ def compare(
 
     A disturbed machine has its masses changed by up to the part ``mass``, each body's on its own, and joint
     forces of up to ``push`` of what its drives can give (or of its weight, of ideal drives) for a tenth of
-    the scene. ``sweep`` gives lists of parameter values: every combination is a variant. The scene's own
+    the scene. ``sweep`` gives lists of parameter values: for every law, each combination of those that it
+    has is a variant. The scene's own
     controller parameters go to its own law, those of sensors and drives to all. Undisturbed runs are timed
-    one after the other, disturbed ones share the processors.
+    one after the other, those of a sweep and disturbed ones share the processors.
     Raises SceneError for laws and parameters that do not fit.
     """
     plan = _plan(scene)
@@ -103,50 +103,23 @@ def compare(
         if progress:
             progress(done, total)
 
-    nominal: dict[str, Trial] = {}
-    for variant in variants:
-        nominal[variant.name] = run_trial(plan, variant.law, variant.words, Disturbance())
-        tell()
-    jobs = list(product(range(len(variants)), range(len(disturbances))))
-    found: dict[tuple[int, int], Figures] = {}
-    for job, figures in _spread(scene, variants, disturbances, jobs, processes or workers()):
-        found[job] = figures
+    found: dict[tuple[int, int], Trial] = {}
+    if not sweep:
+        for i, variant in enumerate(variants):
+            found[i, 0] = run_trial(plan, variant.law, variant.words, Disturbance())
+            tell()
+    cases = (Disturbance(), *disturbances)
+    jobs = [job for job in product(range(len(variants)), range(len(cases))) if job not in found]
+    for job, trial in _spread(scene, variants, cases, jobs, processes or workers()):
+        found[job] = trial
         tell()
     rows = tuple(
-        Row(v, nominal[v.name].figures, tuple(found[i, j] for j in range(len(disturbances))))
+        Row(v, found[i, 0].figures, tuple(found[i, j].figures for j in range(1, len(cases))))
         for i, v in enumerate(variants)
     )
     assert plan.period is not None
+    nominal = {v.name: found[i, 0] for i, v in enumerate(variants)}
     return Comparison(rows, disturbances, plan.period, nominal)
-
-
-def write_csv(comparison: Comparison, path: str | Path) -> Path:
-    """Every run as a row: law, parameters, disturbance, figures. Raises PantographError if it cannot."""
-    path = Path(path)
-    runs = list(_runs(comparison))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as f:
-            writer = csv.DictWriter(f, fieldnames=list(runs[0]))
-            writer.writeheader()
-            writer.writerows(runs)
-    except OSError as e:
-        raise PantographError(f"cannot write {path}: {e.strerror}") from None
-    return path
-
-
-def _runs(comparison: Comparison) -> list[dict[str, Any]]:
-    out = []
-    for row in comparison.rows:
-        cases = zip(
-            ("as modelled", *(d.say for d in comparison.disturbances)),
-            (row.nominal, *row.disturbed),
-            strict=True,
-        )
-        for say, figures in cases:
-            words = " ".join(f"{k}={v}" for k, v in row.variant.words.items())
-            out.append({"law": row.variant.law, "parameters": words, "disturbance": say} | asdict(figures))
-    return out
 
 
 def figure(comparison: Comparison) -> Figure:
@@ -155,15 +128,18 @@ def figure(comparison: Comparison) -> Figure:
     from matplotlib.figure import Figure
 
     chart = Figure(figsize=(10, 9), layout="constrained")
-    top, middle, bottom = chart.subplots(3, 1)
+    (top, middle, bottom), floor = chart.subplots(3, 1), np.inf
     for i, row in enumerate(comparison.rows):
         trial, colour = comparison.trials[row.variant.name], colormaps["tab10"](i % 10)
-        size = np.sqrt(np.sum(trial.error**2, axis=1))
-        top.semilogy(trial.t, np.maximum(size, 1e-12), color=colour, label=row.variant.name)
-        middle.plot(trial.t, np.sqrt(np.sum(trial.tau**2, axis=1)), color=colour)
+        look = {"color": colour, "ls": ("-", "--", ":")[i % 3]}  # equal motions stay both visible
+        size = np.maximum(np.sqrt(np.sum(trial.error**2, axis=1)), 1e-15)
+        top.semilogy(trial.t, size, label=row.variant.name, **look)
+        floor = min(floor, float(np.percentile(size, 2)))
+        middle.plot(trial.t, np.sqrt(np.sum(trial.tau**2, axis=1)), **look)
         dots = [f.rms for f in row.disturbed]
         bottom.plot([i] * len(dots), dots, "o", color=colour, alpha=0.4, ms=5)
         bottom.plot([i], [row.nominal.rms], "_", color=colour, ms=24, mew=3)
+    top.set_ylim(bottom=floor)
     top.set_ylabel("error of all joints [rad, m]")
     middle.set_ylabel("forces of all joints [N m, N]")
     bottom.set_ylabel("RMS error [rad, m]")
@@ -189,11 +165,15 @@ def _plan(scene: Scene) -> Plan:
 def _variants(scene: Scene, laws: Sequence[str], sweep: Mapping[str, Sequence[Any]]) -> list[Variant]:
     own = scene.controller.parameters if scene.controller else {}
     shared = {word: value for word, value in own.items() if word in LOOP_WORDS}
-    out = []
+    out: list[Variant] = []
+    for word in sweep:
+        if not any(word in known_words(law) for law in laws):
+            check_law(laws[0], {word: None})
     for law in laws:
         base = own if scene.controller and law == scene.controller.law else shared
-        for values in product(*sweep.values()):
-            chosen = dict(zip(sweep, values, strict=True))
+        known = {word: values for word, values in sweep.items() if word in known_words(law)}
+        for values in product(*known.values()):
+            chosen = dict(zip(known, values, strict=True))
             label = " ".join([law, *(f"{k}={v}" for k, v in chosen.items())])
             check_law(law, dict(base) | chosen)
             out.append(Variant(law, dict(base) | chosen, label))
@@ -222,31 +202,31 @@ def _disturbances(plan: Plan, trials: int, mass: float, push: float, seed: int) 
 def _spread(
     scene: Scene,
     variants: list[Variant],
-    disturbances: tuple[Disturbance, ...],
+    cases: tuple[Disturbance, ...],
     jobs: list[tuple[int, int]],
     processes: int,
-) -> Any:
-    """Pairs (job, figures) as they are done, on as many processes as wanted."""
+) -> Iterator[tuple[tuple[int, int], Trial]]:
+    """Pairs (job, trial) as they are done, by several processes; with samples where nothing disturbs."""
     if processes == 1 or len(jobs) < 2:
         plan = _plan(scene)
         for i, j in jobs:
-            yield (i, j), run_trial(plan, variants[i].law, variants[i].words, disturbances[j]).figures
+            yield (i, j), run_trial(plan, variants[i].law, variants[i].words, cases[j])
         return
     with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=get_context("spawn")) as pool:
-        pending = {
-            pool.submit(_remote, scene, scene._base, variants[i], disturbances[j]): (i, j) for i, j in jobs
-        }
+        pending = {pool.submit(_remote, scene, scene._base, variants[i], cases[j]): (i, j) for i, j in jobs}
         for done in as_completed(pending):
             yield pending[done], done.result()
 
 
 _PLANS: dict[str, Plan] = {}
+_NONE = np.zeros(0)
 
 
-def _remote(scene: Scene, base: Path | None, variant: Variant, disturbance: Disturbance) -> Figures:
-    """One disturbed run in a process of its own, which keeps the plan for the next one."""
+def _remote(scene: Scene, base: Path | None, variant: Variant, disturbance: Disturbance) -> Trial:
+    """One run in a process of its own, which keeps the plan for the next one."""
     key = scene.model_dump_json()
     if key not in _PLANS:
         scene._base = base
         _PLANS[key] = _plan(scene)
-    return run_trial(_PLANS[key], variant.law, variant.words, disturbance).figures
+    trial = run_trial(_PLANS[key], variant.law, variant.words, disturbance)
+    return trial if disturbance == Disturbance() else replace(trial, t=_NONE, error=_NONE, tau=_NONE)

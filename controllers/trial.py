@@ -44,9 +44,9 @@ class Figures:
 
     ``rms``, ``worst``: errors [rad, m]; ``effort``: RMS of all joint forces together [N m, N]; ``work``: sum
     of |force x speed| [J]; ``saturated``: part of the samples where a drive gave all it could; ``settling``
-    [s] after the keys rest until every joint stays within 2 % of its motion (NaN: it does not); ``overshoot``
-    beyond the last key, of the motion; ``tick``, ``tick99`` [s]: median and 99th percentile of the law's
-    time a sample; ``status``: of the run.
+    [s] after the keys rest until every joint stays within 2 % of its motion (infinite: it does not; NaN: the
+    keys move until the end); ``overshoot`` beyond the last key, of the motion; ``tick``, ``tick99`` [s]:
+    median and 99th percentile of the law's time a sample; ``status``: of the run.
     """
 
     rms: float
@@ -158,13 +158,15 @@ def _arrival(
     """Settling time [s] after the keys rest and overshoot beyond the last key, the worst joint's."""
     last = targets[-1].q
     way = np.array([difference(m, target.q, last) for target in targets])[:, tracked]
-    moving = np.flatnonzero([target.v[tracked].any() for target in targets])
-    rest = min(int(moving[-1]) + 1, len(t) - 1) if len(moving) else 0
+    moving = np.flatnonzero((np.abs(way) > 1e-9).any(axis=1) | [x.v[tracked].any() for x in targets])
+    rest = int(moving[-1]) + 1 if len(moving) else 0
     scale = np.maximum(np.abs(way + error).max(axis=0), 1e-12)
     start = np.where(np.abs(way[0]) > 1e-9, way[0], error[0])
     left = error[rest:]
+    if not len(left):
+        return np.nan, 0.0
     outside = np.flatnonzero((np.abs(left) > _BAND * scale).any(axis=1))
-    settling = 0.0 if not len(outside) else np.nan
+    settling = 0.0 if not len(outside) else np.inf
     if len(outside) and outside[-1] + 1 < len(left):
         settling = float(t[rest + outside[-1] + 1] - t[rest])
     beyond = -left * np.sign(start)

@@ -83,16 +83,22 @@ def make_law(
         raise SceneError(str(e)) from e
 
 
-def check_law(name: str, parameters: dict[str, Any]) -> None:
-    """Raise SceneError when there is no such law, or it has no such parameter."""
+def known_words(name: str) -> tuple[str, ...]:
+    """Parameters of the law ``name``, those of sensors and drives last. Raises SceneError for no law."""
     from ..controllers.reality import LOOP_WORDS
 
     if name not in LAWS:
         raise SceneError(unknown("law", name, LAWS, where="pantograph.controllers"))
-    known = [p.name for p in inspect.signature(LAWS[name]()).parameters.values() if p.kind == p.KEYWORD_ONLY]
+    own = (p.name for p in inspect.signature(LAWS[name]()).parameters.values() if p.kind == p.KEYWORD_ONLY)
+    return (*own, *LOOP_WORDS)
+
+
+def check_law(name: str, parameters: dict[str, Any]) -> None:
+    """Raise SceneError when there is no such law, or it has no such parameter."""
+    known = known_words(name)
     for word in parameters:
-        if word not in (*known, *LOOP_WORDS):
-            raise SceneError(unknown("parameter", word, (*known, *LOOP_WORDS), where=f"law {name!r}"))
+        if word not in known:
+            raise SceneError(unknown("parameter", word, known, where=f"law {name!r}"))
 
 
 def make_engine(name: str) -> Engine:
