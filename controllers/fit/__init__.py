@@ -1,7 +1,9 @@
 """Keyed motion made possible: check it against a machine, retime it, or fit it under full dynamics."""
 
 from .check import Report, Violation, check
-from .collocate import Certificate, Fitted, Phase, fit
+from .collocate import fit
+from .contact import Phase
+from .fitted import Certificate, Fitted
 from .machine import Machine, machine
 from .prove import Proof, prove
 from .retime import Retimed, retime

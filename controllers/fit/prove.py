@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...sim.control import Target
 from ..lqr import LQR
 from ..nominal import difference
-from .collocate import Fitted
+from .fitted import Fitted
 from .machine import Machine
 
 Array = NDArray[np.float64]
