@@ -8,11 +8,18 @@ device.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from .errors import BusError
+
+_GONE: tuple[type[Exception], ...] = (OSError, ValueError)  # what calls on a device that has gone raise
+with suppress(ImportError):  # not on every system
+    import termios
+
+    _GONE = (*_GONE, termios.error)  # is no OSError
 
 if TYPE_CHECKING:
     from .virtual import VirtualBus
@@ -122,7 +129,7 @@ class SerialPort:
             return self.openPort()
         try:
             self._serial.baudrate = baudrate
-        except (OSError, ValueError):
+        except _GONE:
             return False
         return True
 
@@ -158,7 +165,7 @@ class SerialPort:
 
         try:
             return call(*args)
-        except (serial.SerialException, OSError, TypeError, AttributeError) as e:
+        except (serial.SerialException, TypeError, AttributeError, *_GONE) as e:
             raise BusError(
                 f"port {self.port_name} is gone ({e}): is the cable in, the adapter powered?"
             ) from None

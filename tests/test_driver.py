@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 
 import numpy as np
@@ -330,3 +331,16 @@ def test_dead_servo_comes_back() -> None:
         driver.ping(1)
     bus.advance_to(0.9)
     assert driver.ping(1).id == 1
+
+
+def test_every_call_on_a_device_that_has_gone_says_so() -> None:
+    master, slave = os.openpty()
+    port = SerialPort(os.ttyname(slave))
+    port.openPort()
+    os.close(slave)
+    os.close(master)
+    for call in (port.clearPort, lambda: port.readPort(4), lambda: port.writePort(b"x")):
+        with pytest.raises(BusError, match=r"is gone .*is the cable in"):
+            call()
+    assert not port.setBaudRate(57_600)
+    port.closePort()

@@ -123,6 +123,30 @@ def test_killed_mirror_leaves_servos_stopped_by_their_watchdogs(rig: Path, recor
             driver.close()
 
 
+def test_a_device_that_goes_away_is_told_and_ends_the_play(rig: Path, recording: Path) -> None:
+    """As when the cable is torn out: the terminal of killed servos gives errors of several kinds."""
+    link = rig.parent / "bus"
+    servos = subprocess.Popen(
+        [*COMMAND, "simulate", str(rig), "--link", str(link)], stdout=subprocess.PIPE, text=True
+    )
+    assert servos.stdout is not None
+    assert servos.stdout.readline().startswith("port ")
+    play = subprocess.Popen(
+        [*COMMAND, "play", str(recording), str(rig), "--port", str(link)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    wait_for(play, "stream")
+    time.sleep(0.5)
+    servos.kill()
+    servos.wait(5)
+    said = play.communicate(timeout=20)[0]
+    assert play.returncode == 1
+    assert "Traceback" not in said
+    assert "is gone" in said
+
+
 def test_terminated_play_stops_as_promised(rig: Path, recording: Path) -> None:
     with simulated(rig, link=rig.parent / "bus") as port:
         play = subprocess.Popen(
