@@ -157,6 +157,56 @@ def test_every_feature_acts_as_in_mujoco(fluid):
         close(rates[i, model.nq + model.nv :], data.act_dot)
 
 
+AT_ACTUATORS = """<mujoco><worldbody><body pos="0 0 1"><freejoint name="f"/><geom type="box" size=".1 .2 .3"/>
+ <body pos=".2 .1 .3"><joint name="b" type="ball" damping=".1"/><geom type="box" size=".05 .1 .1"/>
+  <body pos=".1 .2 .3"><joint name="h" axis="1 2 3" damping=".1" armature=".02"/>
+   <geom type="box" size=".05 .02 .1" pos="0 .1 0"/></body></body></body></worldbody>
+ <tendon><fixed name="t" damping=".2"><joint joint="h" coef="2"/></fixed></tendon>
+ <actuator><motor joint="h" gear="-3" armature=".1" damping=".2 .3 .1"/>
+  <position joint="h" gear="2" kp="3" armature=".05" damping=".4" group="3"/>
+  <motor joint="b" gear="3 1 2" armature=".04" damping=".2"/>
+  <motor joint="f" gear="1 2 3 0 0 0" {free}/>
+  <velocity tendon="t" gear="1.5" kv=".1" damping=".3 .1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("free", ["", 'armature=".3" damping=".1"'])
+@pytest.mark.parametrize("kind", FORMULATIONS)
+def test_damping_and_armature_given_at_actuators_act_as_in_mujoco(kind, free):
+    model = of_text(AT_ACTUATORS.format(free=free))
+    assert not unsupported(model)
+    eq = equations(model)
+    q, v, _, u = states_of(model, 8, 5)
+    for off in (0, int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)):
+        model.opt.disableflags |= off
+        eq = equations(model)
+        for i in range(len(q)):
+            data = forwarded(model, q[i], v[i], (), u[i])
+            close(value(eq, "forward", kind, q=q[i], v=v[i], u=u[i])["a"], data.qacc)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    close(value(eq, "mass_matrix", q=q[-1])["M"], M.ravel())
+
+
+def test_wrenches_on_bodies_act_as_in_mujoco():
+    xml = TOP.replace("</worldbody>", '<body name="still" pos="1 0 0"><geom size=".1"/></body></worldbody>')
+    model = of_text(xml)
+    wrenches = [(1, False), (2, True), (2, False), (3, False)]
+    smooth = compile_model(model, wrenches=wrenches, cache=None)
+    assert smooth.layout.nw == 24
+    q, v, _, _ = states_of(model, 2, 5)
+    w = np.random.default_rng(1).normal(size=(5, 4, 6))
+    got = smooth.forward(q, v, w=w.reshape(5, 24))
+    for i in range(5):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = q[i], v[i]
+        mujoco.mj_kinematics(model, data)
+        for (body, own), wrench in zip(wrenches, w[i], strict=True):
+            R = data.xmat[body].reshape(3, 3) if own else np.eye(3)
+            data.xfrc_applied[body] += np.concatenate([R @ wrench[:3], R @ wrench[3:]])
+        mujoco.mj_forward(model, data)
+        close(got[i], data.qacc)
+
+
 @pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
 def test_our_models_agree_over_the_whole_state_space(path):
     model = unconstrained(mujoco.MjModel.from_xml_path(str(path)))
@@ -719,8 +769,14 @@ def test_shapes_that_do_not_fit_are_named():
     [
         (("</worldbody>", "</worldbody><equality><joint joint1='a' joint2='b'/></equality>"), "closed loops"),
         (('<motor joint="b"/>', "<muscle joint='b' lengthrange='0 1'/>"), "muscle"),
-        (('<motor joint="b"/>', "<motor joint='b' armature='0.1'/>"), "given at the actuator"),
-        (('<motor joint="b"/>', "<motor joint='b' damping='0.1'/>"), "given at the actuator"),
+        (
+            (
+                '<actuator><motor joint="a"',
+                "<tendon><fixed name='t'><joint joint='a' coef='1'/></fixed></tendon>"
+                '<actuator><motor tendon="t" armature=".1"/><motor joint="a"',
+            ),
+            "given at its actuator",
+        ),
         (('<motor joint="b"/>', "<motor site='s'/>"), "transmission site"),
         (('<motor joint="b"/>', "<position joint='b' kp='1' delay='0.1' nsample='10'/>"), "delay"),
         (('<motor joint="b"/>', "<intvelocity joint='b' kp='1' actrange='-1 1'/>"), "actlimited"),

@@ -315,6 +315,29 @@ def test_divergence_keeps_finite_samples(tmp_path):
     assert 0 < len(segment.t) < 500
 
 
+def test_a_joint_that_nothing_pushes_lies_on_its_limit_without_chatter(tmp_path):
+    """On its bound, weightless, at rest: rounding alone must not make it meet and leave the limit."""
+    xml = """
+<mujoco><option timestep="0.002" gravity="0 0 -9.81"/><worldbody><body>
+  <joint name="x" type="slide" axis="1 0 0" range="-2 2" limited="true"/>
+  <geom size="0.1" mass="1" contype="0" conaffinity="0"/>
+  <body><joint name="swing" axis="0 1 0"/>
+    <geom size="0.05" pos="0 0 -.5" mass="1e-3" contype="0" conaffinity="0"/>
+  </body></body></worldbody></mujoco>"""
+    for angle in (0.0, 0.3, -0.3):
+        scene = scene_of(
+            tmp_path,
+            xml,
+            duration=0.5,
+            initial={"position": {"x": 2.0, "swing": angle}},
+            solver={"step": 0.002},
+        )
+        for r in (run(scene), adaptively(make_plan(scene), 1e-8)):
+            assert r.status == "done"
+            assert r.q[:, 0].max() <= 2.0 + 1e-12
+            assert len(r.events) <= 4
+
+
 # ---- steps that follow a tolerance
 
 
@@ -459,3 +482,59 @@ def test_a_scene_that_no_step_is_small_enough_for_says_so(tmp_path):
     assert np.isfinite(segment.q).all()
     assert 0 < len(segment.t) < 10000
     assert "t = " in segment.message
+
+
+def test_forces_on_bodies_act_as_in_the_contact_engine(tmp_path):
+    """A push in the body's frame, one in the world's over time, and one that begins and ends in between."""
+    xml = """
+<mujoco><option timestep="0.002" gravity="0 0 -9.81"/><worldbody>
+  <body name="upper" pos="0 0 1"><joint name="a" type="ball"/>
+    <geom type="capsule" fromto="0 0 0 .4 0 0" size=".04" mass="1" contype="0" conaffinity="0"/>
+    <body name="lower" pos=".4 0 0"><joint name="b" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 .3 .1 0" size=".03" mass=".5" contype="0" conaffinity="0"/>
+    </body></body>
+</worldbody></mujoco>"""
+    forces = [
+        {"body": "lower", "force": [0.0, 3.0, 1.0], "frame": "body", "start": 0.101, "stop": 0.303},
+        {
+            "body": "upper",
+            "torque": [[0, 0, 0], [0.5, 0, 1], [0, 0, 0]],
+            "times": [0, 0.2, 0.4],
+            "curve": "linear",
+        },
+    ]
+    scene = scene_of(
+        tmp_path, xml, duration=0.5, forces=forces, solver={"step": 0.0005, "integrator": "rk4"}, rate=100
+    )
+    plan = make_plan(scene)
+    assert plan.engine.what == "smooth"
+    ours, theirs = (
+        run(plan),
+        run(dataclasses.replace(plan, engine=dataclasses.replace(plan.engine, what="contact"))),
+    )
+    assert theirs.stats["engine"] == "contact"
+    assert np.abs(ours.q - ours.q[0]).max() > 0.1
+    np.testing.assert_allclose(ours.q, theirs.q, atol=1e-8)
+    np.testing.assert_allclose(ours.a, theirs.a, atol=1e-5)
+    r = adaptively(plan, 1e-10)
+    np.testing.assert_allclose(r.q, ours.q, atol=1e-8)
+
+
+def test_scenes_ask_for_a_tolerance_with_keys_controllers_and_limits(tmp_path):
+    scene = Scene(
+        duration=0.5,
+        models=[{"file": "arm6"}],
+        physics={"contacts": "none"},
+        roles={"tracked": ["shoulder", "elbow"]},
+        keys=[{"joint": "waist", "times": [0, 0.5], "values": [0, 0.8]}],
+        controller={"law": "computed-torque", "period": 0.002},
+        solver={"tolerance": 1e-8, "integrator": "dop853"},
+    )
+    plan = make_plan(scene)
+    assert plan.engine.what == "smooth"
+    r = run(plan, error=True)
+    assert r.status == "done" and len(r.tick_t) == 250
+    finer = adaptively(plan, 1e-12, "verner98")
+    true = np.abs(r.q - finer.q).max()
+    assert 0 < true < 1e-5
+    assert r.error.angle.max() > 0.02 * true

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from ..compile.graph import Scalar
 from ..errors import EngineError, unknown
@@ -24,6 +25,8 @@ PARAMETER_FIELDS = {
     "actuator_gainprm": "actuator",
     "actuator_biasprm": "actuator",
     "actuator_gear": "actuator",
+    "actuator_armature": "actuator",
+    "actuator_damping": "actuator",
     "tendon_stiffness": "tendon",
     "tendon_damping": "tendon",
 }
@@ -33,6 +36,8 @@ _OBJECTS = {
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
     "tendon": mujoco.mjtObj.mjOBJ_TENDON,
 }
+
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 Parameter = tuple[str, str | int] | tuple[str, str | int, int]  # (field, row or its owner's name[, column])
 
@@ -88,6 +93,26 @@ class Fields:
             return symbol
         array: Any = getattr(self.model, name)
         return float(array[row] if array.ndim == 1 else array[row, column])
+
+    def armature(self, dof: int) -> Scalar:
+        """Rotor inertia of a freedom: its own, and gear^2 times that of the actuators on its joint."""
+        total = self.scalar("dof_armature", dof)
+        for actuator in self.actuators_on(int(self.model.dof_jntid[dof])):
+            inertia = self.scalar("actuator_armature", actuator)
+            if hasattr(inertia, "op") or inertia != 0.0:
+                total = total + self.squared_gear(actuator) * inertia
+        return total
+
+    def actuators_on(self, joint: int) -> list[int]:
+        """Actuators that act on a joint."""
+        kinds = self.model.actuator_trntype
+        on = np.isin(kinds, _ON_JOINT) & (self.model.actuator_trnid[:, 0] == joint)
+        return [int(i) for i in np.flatnonzero(on)]
+
+    def squared_gear(self, actuator: int) -> Scalar:
+        """Square of an actuator's gear ratio: of its first entry, for all freedoms, as in MuJoCo."""
+        gear = self.scalar("actuator_gear", int(self.model.actuator_outadr[actuator]))
+        return gear * gear
 
     def vector(self, name: str, row: int, size: int = 3) -> list[Scalar]:
         """The first `size` entries of a row."""

@@ -1,4 +1,4 @@
-"""Wrenches applied to bodies from outside: gravity compensation and drag in the inertia-box model.
+"""Wrenches on bodies from outside: gravity compensation, drag in the inertia-box model, given ones.
 
 Formulas: MuJoCo's documentation, chapter Fluid forces, "Inertia model".
 """
@@ -41,6 +41,31 @@ def applied_wrenches(
 def _push(out: list[Wrench | None], index: int, F: Vector, N: Vector) -> None:
     before = out[index] or (spatial.zeros(), spatial.zeros())
     out[index] = spatial.add(before[0], F), spatial.add(before[1], N)
+
+
+def push_body(
+    fields: Fields,
+    tree: Tree,
+    where: Sequence[Transform],
+    body: int,
+    force: Sequence[Scalar],
+    torque: Sequence[Scalar],
+    out: list[Wrench | None],
+    *,
+    own_frame: bool,
+) -> None:
+    """Add a force at a body's centre of mass and a torque, in the body's own frame or the world's."""
+    index = tree.body_link[body]
+    if index < 0:
+        return  # it stands still
+    X_LB = tree.links[index].bodies[body]
+    if own_frame:
+        turn = Pose(X_LB.R, spatial.zeros())
+        F, N = turn.apply(list(force)), turn.apply(list(torque))
+    else:
+        F, N = (directions_in_links(tree, where, list(part))[index] for part in (force, torque))
+    arm = X_LB.apply(fields.vector("body_ipos", body))
+    _push(out, index, F, spatial.add(N, spatial.cross(arm, F)))
 
 
 def _compensate(

@@ -61,12 +61,24 @@ def passive_forces(
     for dof in range(model.nv):
         if not disabled(model, "DAMPER"):
             out[dof] = out[dof] - damper(fields.polynomial("dof_damping", dof), v[dof])
+            for share, coefficients in _dampers_of_actuators(fields, int(model.dof_jntid[dof])):
+                out[dof] = out[dof] - share * damper(coefficients, v[dof])
         friction = fields.scalar("dof_frictionloss", dof)
         if friction_width is not None and (hasattr(friction, "op") or friction != 0.0):
             speed = sqrt(v[dof] * v[dof] + friction_width**2)
             out[dof] = out[dof] - friction * v[dof] / speed
     for tendon in range(model.ntendon):
         _tendon_forces(fields, tendon, q, v, out)
+    return out
+
+
+def _dampers_of_actuators(fields: Fields, joint: int) -> list[tuple[Scalar, list[Scalar]]]:
+    """Dampers given at the actuators of a joint: gear^2, and coefficients for the joint's own speed."""
+    out = []
+    for actuator in fields.actuators_on(joint):
+        coefficients = fields.polynomial("actuator_damping", actuator)
+        if coefficients:
+            out.append((fields.squared_gear(actuator), coefficients))
     return out
 
 
@@ -141,8 +153,15 @@ def _tendon_forces(
     )
     if stiffness and not disabled(model, "SPRING"):
         force = force - spring(stiffness, tendon_stretch(fields, tendon, q))
-    if damping and not disabled(model, "DAMPER"):
-        force = force - damper(damping, tendon_velocity(model, tendon, v))
+    if not disabled(model, "DAMPER"):
+        speed = tendon_velocity(model, tendon, v)
+        force = force - damper(damping, speed)
+        pulling = np.flatnonzero(
+            (model.actuator_trntype == int(_TRN.mjTRN_TENDON)) & (model.actuator_trnid[:, 0] == tendon)
+        )
+        for actuator in pulling.tolist():
+            coefficients = fields.polynomial("actuator_damping", actuator)
+            force = force - fields.squared_gear(actuator) * damper(coefficients, speed)
     for joint, coefficient in tendon_coefficients(model, tendon).items():
         dof = int(model.jnt_dofadr[joint])
         out[dof] = out[dof] + coefficient * force

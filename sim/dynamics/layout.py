@@ -52,7 +52,9 @@ class Layout:
     """Sizes and addresses of state and prescribed inputs.
 
     The state is x = (q, v, act) over the joints that are not keyed; the prescribed motion is w = (q, v, a)
-    over the keyed ones, each part in the model's order, and after it the controls of the `timed` actuators.
+    over the keyed ones, each part in the model's order, after it the controls of the `timed` actuators, and
+    the `wrenches`: for each pair of a body's id and whether its frame or the world's is meant, a force [N] at
+    its centre of mass and a torque [N m].
     The held controls u are those of the other actuators and, with `forces`, generalized forces on the
     freedoms of the state.
 
@@ -60,6 +62,7 @@ class Layout:
         q_free, v_free, q_keyed, v_keyed: addresses in the model's qpos and qvel.
         quaternions: first entries of quaternions in q (state).
         u_held: actuators whose controls are in u.
+        w_timed, w_wrenches: where those parts of w begin.
         blocks: (kind, first entry in q, first entry in v) of every free joint, in order.
     """
 
@@ -69,9 +72,10 @@ class Layout:
         keyed: tuple[int, ...] = (),
         *,
         timed: tuple[int, ...] = (),
+        wrenches: tuple[tuple[int, bool], ...] = (),
         forces: bool = False,
     ):
-        self.keyed, self.timed, self.forces = keyed, timed, forces
+        self.keyed, self.timed, self.wrenches, self.forces = keyed, timed, wrenches, forces
         self.u_held = [i for i in range(model.nu) if i not in timed]
         self.q_free: list[int] = []
         self.v_free: list[int] = []
@@ -92,5 +96,7 @@ class Layout:
         self.nq, self.nv, self.na = len(self.q_free), len(self.v_free), int(model.na)
         self.nu = len(self.u_held) + (self.nv if forces else 0)
         self.nx = self.nq + self.nv + self.na
-        self.nw = len(self.q_keyed) + 2 * len(self.v_keyed) + len(timed)
+        self.w_timed = len(self.q_keyed) + 2 * len(self.v_keyed)
+        self.w_wrenches = self.w_timed + len(timed)
+        self.nw = self.w_wrenches + 6 * len(wrenches)
         self.nv_model = int(model.nv)

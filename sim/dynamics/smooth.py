@@ -90,6 +90,7 @@ def compile_model(
     parameters: Sequence[Parameter] = (),
     friction_width: float | None = None,
     timed: Sequence[int] = (),
+    wrenches: Sequence[tuple[int, bool]] = (),
     forces: bool = False,
     lanes: int | None = None,
     threads: int | None = None,
@@ -101,10 +102,10 @@ def compile_model(
     `parameters` model entries that become inputs `p`, as (field, name or row[, column]), e.g.
     ("body_mass", "forearm"), ("body_pos", "hand", 2), ("actuator_gainprm", "elbow", 0); `friction_width`
     [rad/s or m/s] smooths dry friction (None leaves it out); the controls of the `timed` actuators (ids) move
-    from `u` to the end of `w`; with `forces`, `u` ends with generalized forces on the state's freedoms;
-    `lanes` fixes the states computed side by side in a batch (default: what the processor is best at);
-    `threads` limits those used for batches; `cache` is the folder of compiled code (True: the user's, None or
-    False: none).
+    from `u` to the end of `w`, where the `wrenches` on bodies follow (see `Layout`); with `forces`, `u` ends
+    with generalized forces on the state's freedoms; `lanes` fixes the states computed side by side in a batch
+    (default: what the processor is best at); `threads` limits those used for batches; `cache` is the folder
+    of compiled code (True: the user's, None or False: none).
 
     Raises EngineError naming everything in the model that the engine cannot do.
     """
@@ -117,7 +118,7 @@ def compile_model(
     if friction_width is not None and not friction_width > 0:
         raise EngineError(f"friction_width must be positive, not {friction_width}")
     folder = default_folder() if cache is True else (cache or None)
-    layout = Layout(model, joints, timed=tuple(timed), forces=forces)
+    layout = Layout(model, joints, timed=tuple(timed), wrenches=tuple(wrenches), forces=forces)
     return Smooth(model, layout, tuple(parameters), friction_width, lanes, threads, Cache(folder))
 
 
@@ -125,8 +126,9 @@ class Smooth:
     """Compiled dynamics of one model; made by `compile_model`. Safe to use from several threads.
 
     The state is q (nq), v (nv) and act (na) over the joints that are not keyed; `w` is the prescribed motion
-    (q, v, a) of the keyed ones, `u` the controls (nu), `p` the parameters. Every function takes one state
-    (1-D arrays) or a batch (2-D, leading axis); an argument given once (1-D) serves a whole batch.
+    (q, v, a) of the keyed ones (and what else `Layout` says), `u` the controls (nu), `p` the parameters.
+    Every function takes one state (1-D arrays) or a batch (2-D, leading axis); an argument given once (1-D)
+    serves a whole batch.
     """
 
     def __init__(
@@ -164,7 +166,7 @@ class Smooth:
     def key(self) -> str:
         """Hash over everything that compiled code of this model depends on."""
         lay = self.layout
-        roles = repr((lay.keyed, lay.timed, lay.forces, self.parameters, self.friction_width))
+        roles = repr((lay.keyed, lay.timed, lay.wrenches, lay.forces, self.parameters, self.friction_width))
         versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
         return key_of(model_fingerprint(self.model), roles, versions, code_fingerprint())
 

@@ -72,8 +72,6 @@ def _joint(model: mujoco.MjModel, joint: int, keyed: Collection[int]) -> list[st
             found.append("armature that differs between the axes of a free joint")
     if model.jnt_actgravcomp[joint] and model.jnt_actfrclimited[joint]:
         found.append("gravity compensation within actuator force limits (actuatorgravcomp)")
-    if model.jnt_actuatorid[joint] >= 0:
-        found.append("damping or armature given at the actuator: give it at the joint")
     return found
 
 
@@ -88,8 +86,9 @@ def _tendon(model: mujoco.MjModel, tendon: int) -> list[str]:
         found.append("a limit on the total actuator force of a tendon")
     if model.tendon_frictionloss[tendon] and not disabled(model, "FRICTIONLOSS"):
         found.append("dry friction of a tendon")
-    if model.tendon_actuatorid[tendon] >= 0:
-        found.append("damping or armature given at the actuator")
+    on = (model.actuator_trntype == int(_TRN.mjTRN_TENDON)) & (model.actuator_trnid[:, 0] == tendon)
+    if model.actuator_armature[on].any():
+        found.append("armature given at its actuator")
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .interface import Array, Held, Problem, Role
-from .limits import Limit, Limits
+from .limits import Limit, Limits, slack
 from .timed import Timed
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class Compiled:
             keyed=[*keyed, *(limit.joint for limit in resting)],
             friction_width=width,
             timed=timed.servos.tolist(),
+            wrenches=list(zip(timed.bodies.tolist(), timed.body_frame.tolist(), strict=True)),
             forces=True,
         )
         lay = self.smooth.layout
@@ -141,7 +142,8 @@ class Compiled:
     def guard_offsets(self, held: Held, limits: Limits) -> Array:
         """What is added to the guards under held inputs: a controller's forces on joints at rest."""
         free = np.zeros(len(self._free(limits)))
-        return np.concatenate([free, [limit.side * held.qfrc[limit.dof] for limit in self.resting]])
+        pushed = np.array([limit.side * held.qfrc[limit.dof] for limit in self.resting])
+        return np.concatenate([free, pushed + slack(pushed)])
 
     def _free(self, limits: Limits) -> list[Limit]:
         """Limits of the joints that do not rest."""
@@ -164,5 +166,7 @@ class Compiled:
         q[:, self.timed_q], v[:, self.timed_v], a[:, self.timed_v] = inputs.q, inputs.v, inputs.a
         for limit in self.resting:
             q[:, self.q_keyed == limit.qpos] = limit.bound
-        out[:, nqk + 2 * nvk :] = inputs.ctrl
+        lay = self.smooth.layout
+        out[:, lay.w_timed : lay.w_wrenches] = inputs.ctrl
+        out[:, lay.w_wrenches :] = inputs.wrench.reshape(len(offsets), -1)
         return out

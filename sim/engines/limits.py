@@ -28,6 +28,11 @@ class Limit:
         return float(self.side * (self.bound - q[self.qpos]))
 
 
+def slack(force: Array) -> Array:
+    """What a limit may pull before it lets go [N, N m]: more than rounding, so that it does so once."""
+    return np.asarray(1e-9 * (1.0 + np.abs(force)))
+
+
 @dataclass(frozen=True)
 class Limits:
     """All limits of a run."""

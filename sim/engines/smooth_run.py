@@ -13,7 +13,7 @@ from ...models import name_of
 from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
 from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
-from .limits import Limit, limits_of
+from .limits import Limit, limits_of, slack
 from .smooth import RESTITUTION, friction_width, mobility
 from .timed import Timed
 
@@ -179,21 +179,13 @@ class Run:
         return np.asarray(self.forces_at(np.array([offset]), q[None], v[None], act[None])[0])
 
     def forces_at(self, offsets: Array, q: Array, v: Array, act: Array) -> Array:
-        """Forces (n, resting) that the limits give at n states."""
+        """Forces (n, resting) that the limits give at n states, and may just pull: see `slack`."""
         c = self.model()
         drive = c.smooth.drive(q[:, c.q_free], v[:, c.v_free], c.held(self.held), act=act, w=c.at(offsets))
         at = [int(np.flatnonzero(c.v_keyed == limit.dof)[0]) for limit in self.resting]
-        return np.asarray(self.sides * (self.pushed - drive[:, at]))
-
-    @property
-    def sides(self) -> Array:
-        """Directions (resting,) in which joints may not go on."""
-        return np.array([limit.side for limit in self.resting], dtype=float)
-
-    @property
-    def pushed(self) -> Array:
-        """Held forces (resting,) on the joints at rest."""
-        return np.array([self.held.qfrc[limit.dof] for limit in self.resting])
+        sides = np.array([limit.side for limit in self.resting], dtype=float)
+        pushed = np.array([self.held.qfrc[limit.dof] for limit in self.resting])
+        return np.asarray(sides * (pushed - drive[:, at]) + slack(pushed))
 
     def release(self) -> None:
         """Let joints go that their limits would have to pull; the one pulled most first."""

@@ -36,7 +36,7 @@ def articulated_solve(
         if link.dadr not in skip:
             for dof, axis in reversed(_axes(link)):
                 inertia, load, step = _eliminate(
-                    inertia, load, dof, axis, b[dof], fields.scalar("dof_armature", dof)
+                    inertia, load, dof, axis, b[dof], fields.armature(dof)
                 )
                 removed[index].append(step)
         if link.parent >= 0:

@@ -53,7 +53,7 @@ def mass_matrix(tree: Tree, where: Sequence[Transform], fields: Fields, skip: Co
             for k, (F, N) in enumerate(_columns(link, composite[index])):
                 row = link.dadr + k
                 for j, value in enumerate(joint_components(link, F, N)[: k + 1]):
-                    M[row, link.dadr + j] = value + (fields.scalar("dof_armature", row) if j == k else 0.0)
+                    M[row, link.dadr + j] = value + (fields.armature(row) if j == k else 0.0)
                 _walk_down(tree, where, index, row, F, N, M, skip)
         if link.parent >= 0:
             composite[link.parent] = composite[link.parent] + _carried(composite[index], at)
