@@ -91,6 +91,92 @@ def test_what_cannot_be_followed_is_told_with_its_reason():
     assert np.abs(np.diff(shaken.q, 2, axis=0)).max() / 0.05**2 <= 10.0
 
 
+def _finely(motion):
+    """Largest velocity and acceleration (nv,) of a motion's curves, ten times as finely, from both sides."""
+    t = np.linspace(motion.t[0], motion.t[-1], 10 * (len(motion.t) - 1) + 1)
+    sides = [motion.clip().evaluate(t, left=left) for left in (False, True)]
+    return (np.max([np.abs(getattr(m, name)).max(axis=0) for m in sides], axis=0) for name in ("v", "a"))
+
+
+@settings(max_examples=8, deadline=None)
+@given(seeds)
+def test_limits_of_a_followed_motion_hold_between_its_instants(seed):
+    rng = np.random.default_rng(seed)
+    model = ik_cases._random_chain(rng, 4)
+    v_max, a_max = rng.uniform(0.3, 2.0, model.nv), rng.uniform(2.0, 20.0, model.nv)
+    p, w, phase = rng.normal(size=(3, 3)), rng.uniform(3, 9, 3), rng.uniform(0, 6, 3)
+    motion = follow(
+        model,
+        lambda t: [Position("tip", 0.4 * np.sin(w * t + phase) @ p)],
+        np.arange(0, 1.2, 0.04),
+        q0=ik_cases._within(model, rng),
+        velocity=v_max,
+        acceleration=a_max,
+    )
+    v, a = _finely(motion)
+    assert (v <= v_max * (1 + 1e-9)).all() and (a <= a_max * (1 + 1e-9)).all()
+    assert motion.speed == pytest.approx((v / v_max).max(), rel=1e-6)
+    assert motion.effort == pytest.approx((a / a_max).max(), rel=1e-6)
+    assert max(motion.speed, motion.effort) > 0.9
+    np.testing.assert_allclose(motion.clip().evaluate(motion.t).q, motion.q, atol=1e-9)
+    between = motion.clip().evaluate(np.linspace(0, 1.16, 200)).q
+    assert all(ik_cases.illegal(model, q) == [] for q in between)
+
+
+def test_limits_hold_for_balls_and_floating_bodies_too():
+    a, b = 0.4, 0.3
+    links = [([0, 0, 0], ik_cases.BALL, (0, 0, 1), None), ([a, 0, 0], ik_cases.HINGE, (0, 0, 1), (0, 2.8))]
+    ball, puppet = ik_cases.chain([*links, ([b, 0, 0], None, None, None)]), load_model("puppet")
+    hand = ik_cases.pose_of(puppet, puppet.qpos0, "left_hand")[0]
+    cases = [
+        (ball, "tip", np.zeros(3), [0.4, 0.4, 0.3], [7, 5, 6], None),
+        (
+            puppet,
+            "left_hand",
+            hand,
+            [0.2, 0.1, 0.2],
+            [6, 9, 8],
+            ["root", "left_elbow", "left_shoulder_pitch"],
+        ),
+    ]
+    for model, at, p, size, w, joints in cases:
+        motion = follow(
+            model,
+            lambda t, at=at, p=p, size=size, w=w: [Position(at, p + size * np.sin(np.multiply(w, t) + 1))],
+            np.arange(0, 1.2, 0.04),
+            velocity=1.0,
+            acceleration=8.0,
+            joints=joints,
+        )
+        v, a = _finely(motion)
+        assert 0.8 < v.max() <= 1 + 1e-6 and 4 < a.max() <= 8 * (1 + 1e-6)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seeds)
+def test_halving_the_tick_halves_the_steps_also_past_singularities(seed):
+    """Law of a path without jumps: no step is longer than its duration allows. The goals pass places where
+    the arm is stretched out or the wrist is singular, on ways that no solution follows at finite speed."""
+    rng = np.random.default_rng(seed)
+    model = wrist_arm()
+    q = np.array([0.2, 0.7, 1.1, 0.3, 0.0, 0.0]) + 0.2 * rng.normal(size=6) * [1, 1, 1, 1, 0, 1]
+    p, quat = ik_cases.pose_of(model, q, "tip")
+    way, v_max = 0.25 * ik_cases.unit(rng), 3.0
+    for dt in (0.02, 0.01):
+        follower, last = Follower(model, dt=dt, q0=q, velocity=v_max), q
+        for k in range(round(1.0 / dt)):
+            goal = Pose("tip", p + way * np.sin(2 * np.pi * k * dt), quat)
+            tick = follower.step([goal])
+            assert np.abs(tick.q - last).max() <= v_max * dt * (1 + 1e-9)
+            assert ik_cases.illegal(model, tick.q) == []
+            last = tick.q
+    times = np.arange(0, 1.0, 0.05)
+    goals = [[Pose("tip", p + way * np.sin(2 * np.pi * t), quat)] for t in times]
+    motion = follow(model, lambda t: goals[round(t / 0.05)], times, q0=q, velocity=v_max)
+    fine = motion.clip().evaluate(np.linspace(0, times[-1], 2000))
+    assert np.abs(np.diff(fine.q, axis=0)).max() <= v_max * times[-1] / 1999 * (1 + 1e-6)
+
+
 @settings(max_examples=15, deadline=None)
 @given(seeds)
 def test_streaming_never_breaks_a_limit_whatever_is_asked(seed):

@@ -30,12 +30,15 @@ from .space import Space
 from .spline import on_curve, smooth_clip, spline_clip
 from .stream import Follower, frozen, limit
 from .verdict import Residual, Verdict
+from .wholes import Posture
 
 Array = NDArray[np.float64]
 Goals = Callable[[float], Sequence[Goal]]
 _TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference acceleration
 _REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
 _STARTS = 6
+_ROUNDING = 1e-9  # of a limit
+_TIGHTER = 4  # times that limits are drawn in until rotations keep them
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ def follow(
     q = _first_guess(line, q0, start, v_max, a_max)
     limits = Limits(line.space, float(t[1] - t[0]), v_max, a_max, start is not None)
     q = _smoothed(line, q, limits, iterations)
+    if max(_ratios(line.clip(q), line.t, line.moved, limits)) > 1.0 + _ROUNDING:
+        q = _within(line, q, limits)
     return _motion(line, q, limits)
 
 
@@ -230,6 +235,31 @@ def _smoothed(line: _Line, q: Array, limits: Limits, iterations: int) -> Array:
     return q
 
 
+def _within(line: _Line, q: Array, limits: Limits) -> Array:
+    """A motion near q (k, nq) that keeps the limits, also where rotations turn so fast that neither the
+    programmes, which see them straight, nor the hull of control points holds them."""
+    v_max, a_max = limits.v_max, limits.a_max
+    for _ in range(_TIGHTER):
+        c = _chased(line, q, limits.dt, v_max, a_max)
+        speed, effort = _ratios(line.clip(c), line.t, line.moved, limits)
+        if max(speed, effort) <= 1.0:
+            break
+        v_max, a_max = (x / max(1.0, 1.001 * over) for x, over in ((v_max, speed), (a_max, effort)))
+    return c
+
+
+def _chased(line: _Line, q: Array, dt: float, v_max: Array, a_max: Array) -> Array:
+    """A motion after q (k, nq), tick by tick."""
+    follower = Follower(line.model, dt=dt, q0=q[0], velocity=v_max, acceleration=a_max, joints=line.joints)
+    first = line.space.difference(q[1:2], q[:1])[0] / dt
+    follower.v = np.clip(first, -v_max, v_max) * line.moved
+    out = [q[0]]
+    for k in range(1, len(q)):
+        follower.q = line.placed(k, follower.q)
+        out.append(follower.step([Posture(q[k])]).q)
+    return np.array(out)
+
+
 def _motion(line: _Line, c: Array, limits: Limits) -> Motion:
     """The motion of control points c (k, nq) and what it leaves of the goals."""
     space, dt = line.space, limits.dt
@@ -245,8 +275,19 @@ def _motion(line: _Line, c: Array, limits: Limits) -> Motion:
     off = np.array([not all(r.met for r in rs) for rs in judged])
     missed = _stretches(line, q, off, position, rotation)
     t, q, v, a, position, rotation = (frozen(x) for x in (line.t, q, v, a, position, rotation))
-    speed, effort = limits.ratio(steps, limits.v_max), limits.ratio(inner, limits.a_max)
-    return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort, line.clip(c))
+    clip = line.clip(c)
+    speed, effort = _ratios(clip, line.t, line.moved, limits)
+    return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort, clip)
+
+
+def _ratios(clip: Clip, t: Array, moved: NDArray[np.bool_], limits: Limits) -> tuple[float, float]:
+    """Largest velocity and acceleration of the curves over their limits, ten times as finely as at t."""
+    if not np.isfinite([limits.v_max, limits.a_max]).any():
+        return 0.0, 0.0
+    fine = np.linspace(t[0], t[-1], 10 * (len(t) - 1) + 1)
+    sides = [clip.evaluate(fine, left=left) for left in (False, True)]
+    speeds = [limits.ratio(motion.v * moved, limits.v_max) for motion in sides]
+    return max(speeds), max(limits.ratio(motion.a * moved, limits.a_max) for motion in sides)
 
 
 def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:
