@@ -19,7 +19,9 @@ from pantograph.sim.dynamics.symbolic import Equations
 
 JOINTS, SHARED = 2, 3
 OPERATIONS = ("add", "sub", "sub", "mul", "mul", "sin", "cos", "neg", "abs", "max", "min", "root", "inverse")
-STEPS = st.lists(st.tuples(st.sampled_from(OPERATIONS), st.integers(0, 99), st.integers(0, 99)), max_size=12)
+STEPS = st.lists(
+    st.tuples(st.sampled_from(OPERATIONS), st.integers(0, 99), st.integers(0, 99)), min_size=2, max_size=12
+)
 
 
 def apply(op, x, y):
@@ -41,7 +43,7 @@ def apply(op, x, y):
 
 
 def limbs_program(count, recipe, after, rng):
-    """Limbs with the same formulas, other constants and signs, summed up and continued from the sum."""
+    """Limbs with the same formulas, other constants and signs; their sum; and products of neighbours."""
     graph = Graph()
     q, shared = graph.inputs("q", count * JOINTS), graph.inputs("s", SHARED)
     mirror = rng.choice([-1.0, 1.0], size=count)
@@ -61,6 +63,7 @@ def limbs_program(count, recipe, after, rng):
         limbs.append(run(limb, [*own, *shared], recipe))
     total = sum((values[-1] * (1.0 / count) for values in limbs), 0.0)
     outputs = [x for limb, values in enumerate(limbs) for x in run(limb, [*values[-2:], total], after)]
+    outputs += [x[-2] * (y[-1] - y[-3]) for x, y in zip(limbs, limbs[1:] + limbs[:1], strict=True)]
     names = [[("q", limb * JOINTS + k) for k in range(JOINTS)] for limb in range(count)]
     sizes = {"q": count * JOINTS, "s": SHARED}
     return Tape.build(sizes, {"y": [*outputs, total]}, [names])
@@ -72,7 +75,7 @@ def evaluated(tape, *arguments):
     return program([np.ascontiguousarray(x) for x in arguments], len(arguments[0]), 1)[0]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=80)
 @given(st.integers(2, 5), STEPS, STEPS, st.integers(0, 2**32 - 1), st.sampled_from([7, 3000]))
 def test_packed_limbs_compute_what_the_tape_says(count, recipe, after, seed, chunk):
     rng = np.random.default_rng(seed)

@@ -192,8 +192,6 @@ class _Writer:
             if rows not in self.pairs:
                 self.pairs[rows] = wide.sincos(operands[0])
             vector = self.pairs[rows][pack.op == COS]
-        elif pack.op == NEG:
-            vector = operands[0]  # the signs of the pack say it
         elif pack.op == ADD:
             vector = _signed_sum(wide, operands[0], operands[1], pack.flips)
         else:
@@ -234,7 +232,8 @@ class _Writer:
 
     def _operand(self, wide: Emitter, source: Source) -> str:
         if source.pack is not None:
-            return self._vector(wide, self.schedule.packs[source.pack])
+            vector = self._vector(wide, self.schedule.packs[source.pack])
+            return wide.turned(vector, source.turn) if source.turn else vector
         if len(set(source.rows)) == 1:
             return wide.splat(self.value(source.rows[0]))
         if all(self.tape.rows[row][0] == CONST for row in source.rows):

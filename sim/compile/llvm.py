@@ -264,6 +264,11 @@ class Emitter:
         """The scalar in one lane."""
         return self.emit(f"extractelement {self.V} {vector}, i64 {lane}")
 
+    def turned(self, vector: str, by: int) -> str:
+        """What stands in lane l + `by`, in lane l."""
+        order = ", ".join(f"i32 {(lane + by) % self.lanes}" for lane in range(self.lanes))
+        return self.emit(f"shufflevector {self.V} {vector}, {self.V} poison, <{self.lanes} x i32> <{order}>")
+
     def side_by_side(self, angles: list[str]) -> list[tuple[str, str]]:
         """Sines and cosines of many angles of one state, several in one vector."""
         if self.lanes > 1 or len(angles) == 1:

@@ -24,10 +24,11 @@ _SIGNED = (SQRT, MIN, MAX, LESS, ATAN2)  # operations that need their operands' 
 
 
 class Source(NamedTuple):
-    """Operands of a pack, limb by limb, and the number of the pack that they are."""
+    """Operands of a pack, limb by limb; where they are a pack, its number and how many limbs it is turned."""
 
     rows: Rows
     pack: int | None = None
+    turn: int = 0
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,16 @@ class _Finder:
     def operands(self, row: int) -> list[_Term]:
         """Operands in an order that does not depend on the limb."""
         op, a, b = self.tape.rows[row]
-        terms = [_Term(a, 1)] if b is None else [_Term(a, 1), _Term(b, -1 if op == SUB else 1)]
+        terms = [self._unsigned(a, 1)]
+        if b is not None:
+            terms.append(self._unsigned(b, -1 if op == SUB else 1))
         return sorted(terms, key=self._tag) if op in _COMMUTE else terms
+
+    def _unsigned(self, row: int, sign: int) -> _Term:
+        """A row with its minus signs taken off."""
+        while self.tape.rows[row][0] == NEG:
+            row, sign = self.tape.rows[row][1], -sign
+        return _Term(row, sign)
 
     def _tag(self, term: _Term) -> tuple[int, int]:
         if term.row in self.place:
@@ -71,9 +80,10 @@ class _Finder:
     def _source(self, rows: Rows) -> tuple[Source, list[int]]:
         """Where operands stand and the signs that they have there."""
         if rows[0] in self.place:
-            number = self.place[rows[0]][0]
-            if self.packs[number].rows == rows:
-                return Source(rows, number), list(self.packs[number].signs)
+            number, turn = self.place[rows[0]]
+            pack = self.packs[number]
+            if pack.rows[turn:] + pack.rows[:turn] == rows:
+                return Source(rows, number, turn), [*pack.signs[turn:], *pack.signs[:turn]]
         return Source(rows), [1] * len(rows)
 
     def form(self, rows: Rows) -> None:
@@ -94,7 +104,7 @@ class _Finder:
         if op in (INPUT, COS, ABS, *_SIGNED):
             signs = [1] * len(rows)
         elif len(of) == 1:
-            signs = [-x for x in of[0]] if op == NEG else of[0]
+            signs = of[0]
         else:
             relative = [x * y for x, y in zip(*of, strict=True)]
             signs, flips = (relative, []) if op == MUL else (of[0], relative)
@@ -111,19 +121,29 @@ class _Finder:
             self.form(rows)
 
     def key(self, row: int) -> tuple[int, tuple[int, ...]] | None:
-        """Limb of a row and what is computed there; None if its operands belong to no limb or to many."""
+        """Limb to which a row belongs and what is computed there; None if no operand is packed.
+
+        What limb l takes from limb l + 1 is the same for every l, counted around.
+        """
         terms = self.operands(row)
-        limbs = {self.place[term.row][1] for term in terms if term.row in self.place}
-        if len(limbs) != 1:
+        limb = next((self.place[term.row][1] for term in terms if term.row in self.place), None)
+        if limb is None:
             return None
         op = self.tape.rows[row][0]
-        return limbs.pop(), (ADD if op == SUB else op, *(x for term in terms for x in self._tag(term)))
+        key = [ADD if op == SUB else op]
+        for term in terms:
+            turn = (self.place[term.row][1] - limb) % self.limbs if term.row in self.place else 0
+            key += [*self._tag(term), turn]
+        return limb, tuple(key)
 
     def extend(self, level: Sequence[int]) -> None:
         """Pack the rows of one depth whose operands are packed."""
         found: dict[tuple[int, ...], list[list[int]]] = {}
         for row in level:
-            if row not in self.taken and (known := self.key(row)) is not None:
+            if row in self.taken or self.tape.rows[row][0] == NEG:
+                continue
+            known = self.key(row)
+            if known is not None:
                 limb, key = known
                 found.setdefault(key, [[] for _ in range(self.limbs)])[limb].append(row)
         for by_limb in found.values():
@@ -154,10 +174,13 @@ def find_packs(tape: Tape) -> list[Pack]:
 
 
 def _depths(tape: Tape) -> list[int]:
+    """Operations before each row, minus signs not counted."""
     out: list[int] = []
     for op, a, b in tape.rows:
-        leaf = op in (CONST, INPUT)
-        out.append(0 if leaf else 1 + max(out[a], -1 if b is None else out[b]))
+        if op in (CONST, INPUT):
+            out.append(0)
+        else:
+            out.append(out[a] if op == NEG else 1 + max(out[a], -1 if b is None else out[b]))
     return out
 
 
@@ -166,6 +189,9 @@ def _shapes(tape: Tape) -> list[int]:
     known: dict[tuple[int, ...], int] = {}
     out: list[int] = []
     for op, a, b in tape.rows:
+        if op == NEG:
+            out.append(out[a])
+            continue
         if op == CONST:
             key: tuple[int, ...] = (op,)
         elif op == INPUT:
