@@ -61,6 +61,8 @@ def control(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(*_tables(result), sep="\n")
+    for line in _failures(result):
+        console.print(line, soft_wrap=True)
     for what, rows in (("control", tables.summary(result)), ("runs", tables.runs(result))):
         console.print(f"table: {tables.save(rows, out / f'{scene.stem}.{what}.{table}')}", soft_wrap=True)
     picture = out / f"{scene.stem}.control.png"
@@ -111,6 +113,18 @@ def _tables(result: Any) -> tuple[Table, Table]:
             f"{f.tick99 / result.period:.1%}",
         )
     return well, cost
+
+
+def _failures(result: Any, most: int = 8) -> list[str]:
+    """Which runs did not reach their end, and why."""
+    says = ("as modelled", *(d.say for d in result.disturbances))
+    lines = [
+        f"{row.variant.name}, {say}: {figures.message or figures.status}"
+        for row in result.rows
+        for say, figures in zip(says, (row.nominal, *row.disturbed), strict=True)
+        if figures.status != "done"
+    ]
+    return lines if len(lines) <= most else [*lines[:most], f"and {len(lines) - most} more: see the table"]
 
 
 def _columns(*heads: str) -> Table:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..sim.compose import make_engine, make_law
 from ..sim.control import Law, Sampled, Target
+from ..sim.engines.common import Broken
 from ..sim.engines.interface import Controls, Held, Problem, Role
 from ..sim.plan import Plan
 from .gains import force_limits
@@ -46,7 +47,7 @@ class Figures:
     of |force x speed| [J]; ``saturated``: part of the samples where a drive gave all it could; ``settling``
     [s] after the keys rest until every joint stays within 2 % of its motion (infinite: it does not; NaN: the
     keys move until the end); ``overshoot`` beyond the last key, of the motion; ``tick``, ``tick99`` [s]:
-    median and 99th percentile of the law's time a sample; ``status``: of the run.
+    median and 99th percentile of the law's time a sample; ``status`` of the run, and why it ended early.
     """
 
     rms: float
@@ -59,6 +60,7 @@ class Figures:
     tick: float
     tick99: float
     status: str
+    message: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +106,21 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     """Run a plan under the law ``law`` with parameters ``words``; the law believes the undisturbed model.
 
     Raises SceneError for a law or parameter that does not fit, and PantographError when the scene has nothing
-    to control.
+    to control. A run that breaks is measured until then; one that breaks at its first sample raises
+    EngineError.
     """
     problem, period = plan.problem, plan.period
     assert period is not None
     watched = _Watched(make_law(law, problem, dict(words), period))
     true = _disturbed(problem, disturbance)
     controls = _Pushed(Sampled(watched, true, period), disturbance)
-    segment = make_engine(plan.engine.what).run(true, (0.0, true.steps * true.step), controls)
-    return _measured(problem, watched, segment.status)
+    try:
+        segment = make_engine(plan.engine.what).run(true, (0.0, true.steps * true.step), controls)
+    except Broken as broken:
+        if not watched.seen:
+            raise
+        segment = broken.segment
+    return _measured(problem, watched, segment.status, segment.message)
 
 
 def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
@@ -126,7 +134,7 @@ def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
     return replace(problem, model=model)
 
 
-def _measured(problem: Problem, watched: _Watched, status: str) -> Trial:
+def _measured(problem: Problem, watched: _Watched, status: str, message: str) -> Trial:
     m, tracked = problem.model, problem.dofs(Role.TRACKED)
     t = np.array([row[0] for row in watched.seen])
     error = np.array([difference(m, row[1], row[3].q) for row in watched.seen])[:, tracked]
@@ -135,8 +143,10 @@ def _measured(problem: Problem, watched: _Watched, status: str) -> Trial:
     given = np.clip(tau, low, high)
     seconds = np.array([row[5] for row in watched.seen])
     at_limit = (tau <= low) | (tau >= high)
-    settling, overshoot = _arrival(t, error, [row[3] for row in watched.seen], tracked, m)
     finite = bool(np.isfinite(error).all()) and status == "done"
+    settling, overshoot = np.inf, np.inf
+    if finite:
+        settling, overshoot = _arrival(t, error, [row[3] for row in watched.seen], tracked, m)
     figures = Figures(
         rms=float(np.sqrt(np.mean(error**2))) if finite else np.inf,
         worst=float(np.abs(error).max()) if finite else np.inf,
@@ -148,6 +158,7 @@ def _measured(problem: Problem, watched: _Watched, status: str) -> Trial:
         tick=float(np.median(seconds)),
         tick99=float(np.percentile(seconds, 99)),
         status=status,
+        message=message,
     )
     return Trial(figures, t, error, tau)
 

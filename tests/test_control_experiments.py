@@ -7,8 +7,10 @@ import sys
 import numpy as np
 import pytest
 from pantograph.controllers import tables
-from pantograph.controllers.experiments import compare, figure
-from pantograph.controllers.trial import Disturbance, run_trial
+from pantograph.controllers.experiments import Row, Variant, _disturbances, compare, figure
+from pantograph.controllers.gains import force_limits
+from pantograph.controllers.nominal import Nominal
+from pantograph.controllers.trial import Disturbance, _disturbed, run_trial
 from pantograph.sim import PantographError, Scene, make_plan, run
 
 PENDULUM = {
@@ -79,10 +81,49 @@ def test_what_never_rests_does_not_settle():
 def test_a_drive_at_its_limit_counts_as_saturated():
     data = PENDULUM | {"actuators": {"*": "controller"}, "physics": {"gravity": False}}
     plan = make_plan(Scene(**data))
-    asked = run_trial(plan, "pd", {"kp": 1e7, "kd": 0.0}, Disturbance()).figures
-    calm = run_trial(plan, "pd", {"kp": 1.0, "kd": 0.0}, Disturbance()).figures
-    assert asked.saturated > 0.9
-    assert calm.saturated == 0.0
+    low, high = force_limits(plan.problem.model)
+    for kp, least, most in ((1e7, 0.9, 1.0), (1.0, 0.0, 0.0), (4 * high.max(), 0.02, 0.9)):
+        trial = run_trial(plan, "pd", {"kp": kp, "kd": 0.0}, Disturbance())
+        at_limit = ((trial.tau <= low) | (trial.tau >= high)).any(axis=1)
+        assert trial.figures.saturated == at_limit.mean()
+        assert least <= trial.figures.saturated <= most
+
+
+def test_a_heavier_machine_has_more_inertia_everywhere():
+    problem = make_plan(Scene(**PENDULUM | {"models": [{"file": "arm6"}], "keys": [], "roles": {}})).problem
+    q = problem.state0.q + 0.3
+    heavy = _disturbed(problem, Disturbance(mass=(1.3,) * problem.model.nbody))
+    rotors = np.diag(problem.model.dof_armature)
+    M, more = (Nominal(p.model).mass_matrix(q) - rotors for p in (problem, heavy))
+    np.testing.assert_allclose(more, 1.3 * M, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        Nominal(heavy.model).weight(q), 1.3 * Nominal(problem.model).weight(q), rtol=1e-9, atol=1e-12
+    )
+
+
+def test_disturbances_are_as_large_as_asked():
+    plan = make_plan(Scene(**PENDULUM | {"actuators": {"*": "controller"}}))
+    drawn = _disturbances(plan, 60, 0.1, 0.2, 5)
+    mass, push = np.array([d.mass for d in drawn]), np.array([d.push for d in drawn])
+    assert 0.09 < np.abs(mass - 1).max() <= 0.1
+    part = np.abs(push) / force_limits(plan.problem.model)[1]
+    assert (part.max(axis=0) <= 0.2).all()
+    assert (part.max(axis=0) > 0.18).all()
+    assert all(d.stop - d.start == pytest.approx(0.1) and 0.1 <= d.start <= 0.7 for d in drawn)
+    assert len({d.say for d in drawn}) == 60
+
+
+def test_a_run_that_diverges_is_counted():
+    good = run_trial(make_plan(Scene(**PENDULUM)), "pd", {}, Disturbance()).figures
+    lost = run_trial(
+        make_plan(Scene(**PENDULUM)), "pd", {"kp": 1e9, "kd": 1e7, "delay": 0.02}, Disturbance()
+    ).figures
+    assert lost.status != "done"
+    assert "at t = 0." in lost.message
+    assert lost.rms == lost.settling == np.inf
+    row = Row(Variant("pd", {}, "pd"), good, (good, lost))
+    assert row.failed == 1
+    assert row.robust == np.inf
 
 
 def test_the_law_believes_the_machine_that_was_modelled():
