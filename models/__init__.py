@@ -1,5 +1,17 @@
 """Robots and scenes as data, and the way to load them."""
 
+import os
+
+try:
+    import mujoco  # noqa: F401
+except Exception as error:
+    if "MUJOCO_GL" not in os.environ:
+        raise
+    raise ImportError(
+        f"MuJoCo does not load with MUJOCO_GL = {os.environ['MUJOCO_GL']!r} ({error}): unset it, or install "
+        "the library that it asks for; films of Pantograph do not depend on it"
+    ) from error
+
 from .chain import chain
 from .diagnose import captured_warnings
 from .errors import ModelError, ModelWarning, PantographError, unknown

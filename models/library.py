@@ -41,7 +41,7 @@ def find(name_or_path: str | Path, *, base: Path | None = None) -> Path:
         ModelError: nothing of that name; the message says where it looked, lists names and offers near ones.
     """
     asked = Path(name_or_path).expanduser()
-    roots = [Path.cwd()] if base is None else [base, Path.cwd()]
+    roots = [Path.cwd()] if base is None else [base.absolute(), Path.cwd()]
     candidates = list(dict.fromkeys(root / asked for root in roots))
     for path in candidates:
         if path.is_file():

@@ -291,7 +291,8 @@ def _step(setup: Setup, engine: str, period: float | None) -> tuple[float, Choic
     elif period is not None:
         h = float(period / np.ceil(period / min(own, duration) - 1e-9))
         why = "the model file says so" if _same(h, own) else f"the model's {own:g} s fitted to the period"
-        why += f"; {round(period / h)} a controller period"
+        n = round(period / h)
+        why += f"; {n} step{'s' * (n > 1)} a controller period"
     else:
         h = float(duration / np.ceil(duration / own - 1e-6))
         why = "the model file says so" if _same(h, own) else f"the model's {own:g} s fitted to the duration"

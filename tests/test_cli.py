@@ -218,6 +218,46 @@ def test_films_of_a_recording(pantograph, folder):
     assert "no camera 'top'" in err
 
 
+def test_ctrl_c_in_a_film_says_what_is_kept(pantograph, folder, monkeypatch):
+    """Typer makes a silent exit of Ctrl-C; a film keeps its first frames."""
+    from pantograph.sim import film
+
+    pantograph("run", "swing.toml")
+
+    def frames(*args, **kwargs):
+        yield np.zeros((48, 64, 3), dtype=np.uint8)
+        raise KeyboardInterrupt
+
+    shoot = sys.modules["pantograph.sim.shoot"]
+    monkeypatch.setattr(shoot, "film", lambda m, t, q, path, **_: film.write(path, frames(), fps=30.0))
+    code, out, err = pantograph("film", "out/swing.npz", "f.mp4")
+    assert (code, out) == (130, "")
+    assert err == "interrupted; the film so far is f.mp4\n"
+    assert (folder / "f.mp4").is_file()
+    monkeypatch.setattr(shoot, "film", lambda *args, **_: (_ for _ in ()).throw(KeyboardInterrupt))
+    code, _, err = pantograph("run", "swing.toml", "--film", "g.mp4")
+    assert (code, err) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--out", "file"), "cannot write into file: File exists; name another folder with --out"),
+        (("--out", "file/deeper"), "cannot write into file/deeper: Not a directory"),
+        (("--film", "x.avi"), "cannot write '.avi' files"),
+        (("--mirror", "nope"), "no rig file nope"),
+        (("--mirror", "wx250s"), "no joint 'waist'"),
+    ],
+)
+def test_what_would_spoil_the_end_is_found_before_the_work(pantograph, folder, monkeypatch, words, said):
+    module = sys.modules[run.__module__]
+    monkeypatch.setattr(module, "run", lambda *args, **_: pytest.fail("simulated"))
+    (folder / "file").touch()
+    code, _, err = pantograph("run", "swing.toml", *words)
+    assert code == 2
+    assert said in err
+
+
 def test_a_new_scene_runs(pantograph, folder):
     code, out, _ = pantograph("new", "deep/wave.toml")
     assert code == 0
@@ -310,7 +350,7 @@ def test_ctrl_c_keeps_what_was_recorded(folder, engine):
             out, err = process.communicate(timeout=60)
         finally:
             process.kill()
-        r = load(folder / "out" / "long.npz") if (folder / "out").exists() else None
+        r = load(folder / "out" / "long.npz") if (folder / "out" / "long.npz").exists() else None
         if r is not None and len(r.t) > 1:
             break
     assert process.returncode == 130, (out, err)
@@ -331,3 +371,25 @@ def test_a_users_own_modules_do_not_break_the_command(folder):
         out, err = process.communicate(timeout=60)
         assert (process.returncode, err) == (0, "")
         assert "recording: out/swing.npz" in out
+
+
+def test_a_setting_of_mujoco_that_cannot_work_is_named(folder):
+    """MuJoCo loads PyOpenGL for MUJOCO_GL = osmesa; without the library that fails with words of its own."""
+    (folder / "OpenGL").mkdir()
+    (folder / "OpenGL" / "__init__.py").write_text("raise AttributeError('no glGetError')\n")
+    environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYTHONPATH": str(folder)}
+    environment["PYTHONPATH"] += os.pathsep + os.environ.get("PYTHONPATH", "")
+    process = subprocess.run(
+        [sys.executable, "-c", "import pantograph.sim"], env=environment, capture_output=True, text=True
+    )
+    assert "MuJoCo does not load with MUJOCO_GL = 'osmesa' (no glGetError): unset it" in process.stderr
+
+
+def test_the_models_of_the_data_folder_are_listed(pantograph, folder, monkeypatch):
+    robot = folder / "data" / "robots" / "mine"
+    robot.mkdir(parents=True)
+    (robot / "my_robot.xml").write_text(SPRING)
+    monkeypatch.setenv("PANTOGRAPH_DATA", str(folder / "data"))
+    assert "robots of the data folder: my_robot\n" in pantograph("models")[1]
+    monkeypatch.setenv("PANTOGRAPH_DATA", str(folder))
+    assert "robots of the data folder" not in pantograph("models")[1]

@@ -656,6 +656,18 @@ def decoded(path: Path) -> tuple[list[np.ndarray], float]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], rate
 
 
+@pytest.mark.parametrize("fps", [0, -1, 1e9, np.inf, np.nan])
+def test_impossible_rates_are_refused_before_anything_is_computed(tmp_path, fps):
+    model = scene('<geom size=".1"/>')
+    for start in (
+        lambda: write(tmp_path / "film.mp4", frames(1), fps=fps),
+        lambda: film(model, [0, 1], np.zeros((2, 0)), tmp_path / "film.mp4", fps=fps),
+    ):
+        with pytest.raises(FilmError, match="fps must be positive and at most 1000, not"):
+            start()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("w", "h"), [(32, 24), (33, 24), (32, 25), (31, 17)])
 @pytest.mark.parametrize("fps", [30, 23.976, 12])
 def test_mp4_holds_every_frame_in_order_at_its_rate(tmp_path, w, h, fps):

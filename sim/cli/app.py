@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,9 +46,22 @@ def run_app() -> None:
     except PantographError as e:
         errors.print(f"[bold red]error:[/] {escape(str(e))}", highlight=False, soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        errors.print("interrupted")
+    except KeyboardInterrupt as e:
+        _tell_interrupt(e)
         sys.exit(130)
+    except SystemExit as e:
+        _tell_interrupt(e)
+        raise
+
+
+def _tell_interrupt(error: BaseException | None) -> None:
+    """Say what Ctrl-C left, if it is behind an error; typer makes a silent exit of it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    if error is not None:
+        errors.print(
+            "; ".join(["interrupted", *getattr(error, "__notes__", ())]), highlight=False, soft_wrap=True
+        )
 
 
 @app.command(epilog="Example: pantograph run wave.toml --film wave.mp4 --plot wave.png --error")
@@ -89,6 +103,7 @@ def run(
             raise PantographError("--live follows a simulation on a rig: name it with --mirror RIG")
         _mirror(plan, mirror, rig_motion, options | {"live": True})
         return
+    _foresee(plan, out, film, mirror)
     with show.progress(f"simulating {scene.stem}", plan.problem.duration) as advance:
         try:
             recording = run_scene(plan, error=error, progress=advance)
@@ -118,7 +133,7 @@ def film(
     recording: RecordingFile,
     path: Annotated[Path, typer.Argument(help="Film: .mp4, .gif, a folder, or a picture with --at.")],
     camera: Annotated[str | None, typer.Option(help="Camera of the scene or the model file.")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second.", min=0.1)] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second.", min=0.1, max=1000)] = None,
     size: Annotated[str | None, typer.Option(help="Picture size, as 640x480.")] = None,
     shadows: Annotated[bool | None, typer.Option(help="Draw shadows; default as the scene says.")] = None,
     at: Annotated[float | None, typer.Option(help="One picture at this time [s] instead of a film.")] = None,
@@ -214,6 +229,26 @@ def schema() -> None:
     from ..scene.schema import Scene
 
     typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
+
+
+def _foresee(plan: Any, out: Path, film: Path | None, rig: str | None) -> None:
+    """Find before the work what would spoil its end."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as e:
+        raise PantographError(
+            f"cannot write into {out}: {e.strerror}; name another folder with --out"
+        ) from None
+    if film is not None:
+        from ..film import check_path
+
+        check_path(_in(out, film))
+    if rig is not None:
+        from ...hardware.rig import check_model, load_rig
+
+        check_model(load_rig(rig), plan.problem.model)
 
 
 def _mirror(motion: Any, rig: str, path: Path, options: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ...models import load_model, names_of
+from ...models import data_robots, load_model, names_of
 from ..engines.interface import Drive, Role
 from ..errors import FilmWarning
 from ..plan import Plan
@@ -142,6 +142,9 @@ def models(console: Console, names: tuple[str, ...]) -> None:
         m = load_model(name)
         table.add_row(name, str(m.njnt), str(m.nv), str(m.nu))
     console.print(table)
+    robots = ", ".join(data_robots())
+    if robots:
+        console.print(f"robots of the data folder: {robots}", soft_wrap=True)
     console.print("'pantograph models NAME' describes one; any MJCF or URDF file works in a scene as well")
 
 

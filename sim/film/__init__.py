@@ -13,9 +13,9 @@ from ..errors import FilmError, FilmWarning
 from .cameras import Camera
 from .lights import Light, default_lights
 from .renderer import Renderer
-from .video import write
+from .video import check_path, check_rate, write
 
-__all__ = ["Camera", "Light", "Renderer", "default_lights", "film", "still", "write"]
+__all__ = ["Camera", "Light", "Renderer", "check_path", "default_lights", "film", "still", "write"]
 
 Floats = NDArray[np.floating]
 
@@ -46,8 +46,7 @@ def film(
     OpenGL library.
     """
     times, motion = _checked(model, t, q)
-    if fps <= 0:
-        raise FilmError(f"fps must be positive, not {fps}")
+    check_rate(fps)
     shot = times[0] + np.arange(int((times[-1] - times[0]) * fps + 1e-9) + 1) / fps
     view = (camera or Camera.auto(model, motion, aspect=size[0] / size[1])).follow(model, times, motion)
     with Renderer(model, width=size[0], height=size[1], lights=lights, shadows=shadows) as renderer:

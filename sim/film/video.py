@@ -19,6 +19,7 @@ from ..errors import FilmError
 Frame = NDArray[np.uint8]
 
 _STILLS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_MOST_FRAMES = 1000  # a second
 
 
 def write(
@@ -38,31 +39,14 @@ def write(
     - any other picture format of Pillow: one still.
 
     A file appears under its name only when complete. On Ctrl-C the shorter film is completed and kept, and
-    the KeyboardInterrupt goes on; on any other error nothing is left. `total` is the number of frames to
-    come, for the time left on the progress bar, which shows on terminals only.
+    the KeyboardInterrupt goes on, with a note that says so; on any other error nothing is left. `total` is
+    the number of frames to come, for the time left on the progress bar, which shows on terminals only.
 
     Raises FilmError for an unknown suffix, no frames, frames of unequal size, or an unwritable path.
     """
     target = Path(path)
-    if fps <= 0:
-        raise FilmError(f"fps must be positive, not {fps}")
-    if target.is_dir():
-        writer: Callable[[Path, Iterator[Frame], float], None] = _write_folder
-    elif "%" in target.name:
-        writer = _write_pictures
-    elif not target.suffix:
-        writer = _write_folder
-    elif target.suffix.lower() == ".mp4":
-        writer = _write_mp4
-    elif target.suffix.lower() == ".gif":
-        writer = _write_gif
-    elif target.suffix.lower() in _STILLS:
-        writer = _write_still
-    else:
-        raise FilmError(
-            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, frames as 'name_%04d.png' "
-            f"or a folder; stills: {', '.join(_STILLS)}"
-        )
+    check_rate(fps)
+    writer = _writer_of(target)
     shown = _with_progress(frames, total, target.name) if progress else iter(frames)
     try:
         (target if writer is _write_folder else target.parent).mkdir(parents=True, exist_ok=True)
@@ -70,6 +54,37 @@ def write(
     except OSError as error:
         raise FilmError(f"{target}: cannot be written: {error}") from error
     return target
+
+
+def check_path(path: str | os.PathLike[str]) -> None:
+    """Raise FilmError for a path that no film can have by its ending."""
+    _writer_of(Path(path))
+
+
+def check_rate(fps: float) -> None:
+    """Raise FilmError for a number of frames a second that no film has."""
+    if not 0 < fps <= _MOST_FRAMES:
+        raise FilmError(f"fps must be positive and at most {_MOST_FRAMES}, not {fps:g}")
+
+
+def _writer_of(target: Path) -> Callable[[Path, Iterator[Frame], float], None]:
+    if target.is_dir():
+        return _write_folder
+    if "%" in target.name:
+        return _write_pictures
+    ending = target.suffix.lower()
+    known = {
+        "": _write_folder,
+        ".mp4": _write_mp4,
+        ".gif": _write_gif,
+        **dict.fromkeys(_STILLS, _write_still),
+    }
+    if ending not in known:
+        raise FilmError(
+            f"{target}: cannot write {target.suffix!r} files; films: .mp4, .gif, frames as 'name_%04d.png' "
+            f"or a folder; stills: {', '.join(_STILLS)}"
+        )
+    return known[ending]
 
 
 def _checked(frames: Iterator[Frame]) -> Iterator[Frame]:
@@ -123,8 +138,9 @@ class _Kept:
             return True
         return False
 
-    def reraise(self) -> None:
+    def reraise(self, target: Path) -> None:
         if self._interrupt is not None:
+            self._interrupt.add_note(f"the film so far is {target}")
             raise self._interrupt
 
 
@@ -152,7 +168,7 @@ def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
                 container.mux(stream.encode(picture))
                 kept.frames += 1
         container.mux(stream.encode(None))
-    kept.reraise()
+    kept.reraise(target)
 
 
 def _write_gif(target: Path, frames: Iterator[Frame], fps: float) -> None:
@@ -179,8 +195,8 @@ def _write_gif(target: Path, frames: Iterator[Frame], fps: float) -> None:
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(indices, format="pal8")))
                     written.frames += 1
             container.mux(stream.encode(None))
-    kept.reraise()
-    written.reraise()
+    kept.reraise(target)
+    written.reraise(target)
 
 
 def _spool(frames: Iterable[Frame], spool: IO[bytes], kept: _Kept) -> tuple[Any, list[int], tuple[int, ...]]:
