@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import mujoco
@@ -49,7 +51,16 @@ class Kinematics:
         self._frames: dict[str, Frame] = {}
         self._mounts: dict[str, _Mount] = {}
         self._mass: list[tuple[float, Frame]] | None = None
-        self._data = mujoco.MjData(model)
+
+    @cached_property
+    def _data(self) -> mujoco.MjData:
+        return mujoco.MjData(self.model)
+
+    def alone(self) -> Kinematics:
+        """The same frames, for somebody else."""
+        out = copy(self)
+        out.__dict__.pop("_data", None)
+        return out
 
     def frame(self, text: str) -> Frame:
         """The frame of a text as in `parse_frame`; ModelError (lists what exists) for an unknown one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import mujoco
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from ...models.naming import joint_names, lookup, name_of
 from ..errors import ModelError, unknown
-from .chains.machine import Prepared, charge, prepared, structure
+from .chains.machine import Prepared, charge, numbers, prepared, structure, words
+from .chains.rows import is_known
 from .goals import BAND, Goal, Rows
 from .loops import Closure, closures
 from .pose import Kinematics
@@ -64,6 +66,7 @@ class Problem:
     def _layout(self) -> None:
         self._name: str | None = None
         self._prepared: Prepared | None = None
+        self._looked = False
         hard = [g.weight is None for g in self.goals]
         strict = hard if any(hard) else [True] * len(hard)
         scale = length_of(self.model, self.kinematics, self.goals)
@@ -97,28 +100,41 @@ class Problem:
         self.weight, self.band = np.concatenate(weight), np.concatenate(band)
         self.metres, self.scale = np.concatenate(metres).astype(bool), scale
 
-    def prepared(self, *, build: bool = False) -> Prepared | None:
-        """Machine code for this problem, if there is any by now; with `build`, made where it pays."""
+    @property
+    def name(self) -> str:
+        """What machine code for this problem goes by; empty where there can be none."""
         if self._name is None:
             self._name = structure(self) or ""
-            if self._name:
-                self._prepared = prepared(self, self._name)
-        if build and self._name and self._prepared is None:
-            self._prepared = prepared(self, self._name, build=True)
+        return self._name
+
+    def prepared(self, *, build: bool = False) -> Prepared | None:
+        """Machine code for this problem, if there is any by now; with `build`, made where it pays."""
+        if self._prepared is None and self.name and (build or not self._looked):
+            self._prepared, self._looked = prepared(self, self.name, build=build), True
         return self._prepared
+
+    def beside(self, q: Array) -> Rows:
+        """`raw` of the wishes beside these goals."""
+        assert self.wished is not None
+        quick = self.prepared()
+        if quick is None or not quick.machine.layout.along:
+            return self.wished.raw(q)
+        r, J = quick.machine.rows(q, quick.a)
+        return Rows(r[:, self.m :], J[:, self.m :])
 
     def raw(self, q: Array) -> Rows:
         """Residuals (n, m) [m or rad] and Jacobian (n, m, nv), without weights."""
         quick = self.prepared()
         if quick is not None:
-            return quick.machine.rows(q, quick.a)
+            r, J = quick.machine.rows(q, quick.a)
+            return Rows(r[:, : self.m], J[:, : self.m])
         begin = time.perf_counter()
         c = self.kinematics.at(q)
         parts = [g.rows(c) for g in self.goals] + [loop.rows(c) for loop in self.loops]
         J = np.concatenate([p.J for p in parts], axis=1)
         J[:, :, ~self.moved] = 0.0
         rows = Rows(np.concatenate([p.r for p in parts], axis=1), J)
-        charge(self._name or "", 2 * (time.perf_counter() - begin))  # linear algebra costs as much again
+        charge(self.name, 2 * (time.perf_counter() - begin))  # linear algebra costs as much again
         return rows
 
     def weighted(self, rows: Rows) -> Rows:
@@ -139,11 +155,72 @@ class Problem:
         out.moved &= self.moved
         return out
 
+    def aimed(self, goals: Sequence[Goal]) -> Problem:
+        """The same problem with goals that differ from these in what they aim at alone."""
+        out = copy(self)
+        out.goals, out._prepared, out._looked = tuple(goals), None, False
+        out.kinematics = self.kinematics.alone()
+        pairs = zip(self.groups, goals, strict=False)  # loops come last
+        changed = tuple(Group(goal.label, goal, group.rows) for group, goal in pairs)
+        out.groups = changed + self.groups[len(changed) :]
+        return out
+
     def without_limits(self) -> Problem:
         """The same goals without joint limits."""
         out = Problem(self.model, self.goals, Space(self.model, limits=False), kinematics=self.kinematics)
         out.moved &= self.moved
         return out
+
+
+class Asked(NamedTuple):
+    """A question: goals that are judged, and wishes beside them (also `judged.wished`)."""
+
+    judged: Problem
+    wished: Problem | None
+
+
+_EARLIER: dict[object, Asked] = {}
+_MOST_EARLIER = 32
+
+
+def asked(model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None) -> Asked:
+    """The question of `solve`.
+
+    What follows from the model and from the names in the goals is taken over from an earlier question that
+    differed in targets alone, as along a track or live.
+    """
+    if not all(is_known(goal) for goal in goals):
+        return _asked(model, goals, joints)
+    limits = model.jnt_range.tobytes()
+    given = [(words(g), g.weight, g.tolerance) for g in goals]
+    key = repr((id(model), given, joints)), limits, *numbers(model)
+    earlier = _EARLIER.get(key)
+    if earlier is None:
+        earlier = _asked(model, goals, joints)
+        _ = earlier.judged.name  # once for all
+        while len(_EARLIER) >= _MOST_EARLIER:
+            _EARLIER.pop(next(iter(_EARLIER)), None)
+        _EARLIER[key] = earlier  # holds the model, so that its id stays its own
+    if earlier.wished is None:
+        return Asked(earlier.judged.aimed(goals), None)
+    judged = earlier.judged.aimed([g for g in goals if g.weight is None])
+    judged.wished = wished = earlier.wished.aimed([g for g in goals if g.weight is not None])
+    return Asked(judged, wished)
+
+
+def _asked(model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None) -> Asked:
+    problem = Problem(model, goals, Space(model), joints=joints)
+    hard = [g for g in goals if g.weight is None]
+    soft = [g for g in goals if g.weight is not None]
+    if not hard or not soft:
+        return Asked(problem, None)
+    judged, wished = problem.only(hard), problem.only(soft)
+    judged.moved, wished.moved = problem.moved, problem.moved
+    wished.loops, judged.loops = [], problem.loops
+    judged.wished = wished
+    judged._layout()
+    wished._layout()
+    return Asked(judged, wished)
 
 
 def length_of(model: mujoco.MjModel, kinematics: Kinematics, goals: Sequence[Goal]) -> float:

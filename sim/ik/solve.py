@@ -14,9 +14,9 @@ from .chains.closed_form import candidates
 from .goals import Goal
 from .numeric.descend import Descent, sharpen, tighten
 from .numeric.search import Search
-from .numeric.settle import Settled, Wish, settle, settle_near
+from .numeric.settle import Settled, Wish, settle, settle_near, worth
 from .preferences import FAINT, Preference, preference, wishes
-from .problem import Problem, unwound
+from .problem import Problem, asked, unwound
 from .proofs.diagnose import diagnose, excluded
 from .space import Space
 from .verdict import Residual, Solution, Verdict
@@ -54,10 +54,8 @@ def solve(
     """
     begin = time.perf_counter()
     goals = (goals,) if isinstance(goals, Goal) else tuple(goals)
-    space = Space(model)
-    start = space.check(model.qpos0 if q0 is None else q0)
-    problem = Problem(model, goals, space, joints=joints)
-    judged, wished = _parts(problem)
+    judged, wished = asked(model, goals, joints)
+    start = judged.space.check(model.qpos0 if q0 is None else q0)
     prefers = preference(prefer, judged, start, obstacles)
     wish: Wish = prefers if wished is None else wishes(wished, prefers)
     search = Search(judged, start, restarts=restarts, seed=seed, hopeless=lambda: excluded(judged, start))
@@ -67,52 +65,38 @@ def solve(
     if len(found):
         best = _settled(judged, found, wish, start, every=all, near=prefer == "near")
         verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
-        return _solution(problem, best[0], verdict, best if all else best[:1], None, search, begin)
+        return _solution(judged, goals, best[0], verdict, best if all else best[:1], None, search, begin)
     nearest = _nearest(judged, search.best)
     if nearest.met[0]:  # a slow end, as at a singular boundary, got there after all
         verdict = Verdict("solved", True, _solved_words(judged, nearest.q), restarts=search.used)
-        return _solution(problem, nearest.q[0], verdict, nearest.q, None, search, begin)
+        return _solution(judged, goals, nearest.q[0], verdict, nearest.q, None, search, begin)
     diagnosis = diagnose(judged, search, nearest)
     if diagnosis.found is not None:
         best = _settled(judged, diagnosis.found[None], wish, start, every=False, near=prefer == "near")
         verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
-        return _solution(problem, best[0], verdict, best, None, search, begin)
+        return _solution(judged, goals, best[0], verdict, best, None, search, begin)
     q = diagnosis.nearest
-    if wished is not None and any(g.weight is None for g in problem.goals):
+    if wished is not None:
         q = nearest.q[0] if q is None else q
     answer = unwound(judged, nearest.q if q is None else q[None], start)[0]
-    return _solution(
-        problem, answer, diagnosis.verdict, answer[:0].reshape(0, 0), diagnosis.q_free, search, begin
-    )
-
-
-def _parts(problem: Problem) -> tuple[Problem, Problem | None]:
-    """The judged goals as a problem, and the wishes beside them."""
-    hard = [g for g in problem.goals if g.weight is None]
-    soft = [g for g in problem.goals if g.weight is not None]
-    if not hard or not soft:
-        return problem, None
-    judged, wished = problem.only(hard), problem.only(soft)
-    judged.moved, wished.moved = problem.moved, problem.moved
-    wished.loops, judged.loops = [], problem.loops
-    judged.wished = wished
-    judged._layout()
-    wished._layout()
-    return judged, wished
+    none = answer[:0].reshape(0, 0)
+    return _solution(judged, goals, answer, diagnosis.verdict, none, diagnosis.q_free, search, begin)
 
 
 def _settled(judged: Problem, found: Array, wish: Wish, start: Array, *, every: bool, near: bool) -> Array:
     """Distinct solutions (k, nq) that serve the wish best, best first."""
-    found = unwound(judged, found, start)
-    value = np.sum(wish(found).r ** 2, axis=1)
-    picked = found[np.argsort(value, kind="stable")[: None if every else 5]]
+    found, faint = unwound(judged, found, start), 1.0 if judged.wished is None else FAINT
+    picked = found
+    if len(found) > (1 if every else 5):
+        value = worth(judged, found, start, faint) if near else np.sum(wish(found).r ** 2, axis=1)
+        picked = found[np.argsort(value, kind="stable")[: None if every else 5]]
     ends: list[Settled]
     if near:
-        ends = settle_near(judged, picked, start, wish, faint=1.0 if judged.wished is None else FAINT)
+        ends = settle_near(judged, picked, start, wish, faint=faint)
     else:
         ends = [settle(judged, q, wish) for q in picked]
     ends.sort(key=lambda end: end.value)
-    q = np.array([tighten(judged, end.q) for end in ends])
+    q = np.array([tighten(judged, end.q) for end in (ends if every else ends[:1])])
     return distinct(judged.space, unwound(judged, q, start))
 
 
@@ -148,7 +132,10 @@ def _solved_words(problem: Problem, q: Array) -> str:
 
 def residuals(problem: Problem, q: Array) -> tuple[Residual, ...]:
     """Residuals of every goal and loop at q (nq,)."""
-    r = problem.raw(q[None]).r
+    return _residuals(problem, problem.raw(q[None]).r)
+
+
+def _residuals(problem: Problem, r: Array) -> tuple[Residual, ...]:
     out = []
     for group in problem.groups:
         part, tolerance = r[:, group.rows], problem.tolerance[group.rows]
@@ -162,8 +149,18 @@ def residuals(problem: Problem, q: Array) -> tuple[Residual, ...]:
     return tuple(out)
 
 
+def _all_residuals(judged: Problem, goals: Sequence[Goal], q: Array) -> tuple[Residual, ...]:
+    """Residuals in the order of the goals, then of loops."""
+    hard = residuals(judged, q)
+    if judged.wished is None:
+        return hard
+    first, soft = iter(hard), iter(_residuals(judged.wished, judged.beside(q[None]).r))
+    return (*(next(first if g.weight is None else soft) for g in goals), *first)
+
+
 def _solution(
-    problem: Problem,
+    judged: Problem,
+    goals: Sequence[Goal],
     q: Array,
     verdict: Verdict,
     solutions: Array,
@@ -177,6 +174,6 @@ def _solution(
     seconds = time.perf_counter() - begin
     verdict = replace(verdict, restarts=search.used)
     return Solution(
-        arrays[0], residuals(problem, q), verdict, arrays[1], None if free is None else arrays[2],
+        arrays[0], _all_residuals(judged, goals, q), verdict, arrays[1], None if free is None else arrays[2],
         search.iterations, search.used, seconds,
     )  # fmt: skip

@@ -156,10 +156,16 @@ def _split(at: Layout, a: Sequence[Node]) -> _Split:
 
 
 def rows_tape(problem: Problem, at: Layout) -> tuple[Tape, list[tuple[int, int]]]:
-    """Program (q, a) -> (r, J): all residuals without weights, and the entries of J listed beside it."""
+    """Program (q, a) -> (r, J): all residuals without weights, and the entries of J listed beside it.
+
+    Rows of wishes follow those of the problem, on the way along the goals.
+    """
     graph = Graph()
     q, a = graph.inputs("q", problem.space.nq), graph.inputs("a", at.size)
-    rows = problem_rows(Scene(problem, q), a[: at.aims])
+    given = _split(at, a)
+    rows = problem_rows(Scene(problem, q), given.aims)
+    if at.along and problem.wished is not None:
+        rows += problem_rows(Scene(problem.wished, q), given.soft_aims)
     entries = [(i, v) for i, row in enumerate(rows) for v in row.J]
     values = [x for row in rows for x in row.J.values()]
     tape = Tape.build({"q": len(q), "a": at.size}, {"r": [row.r for row in rows], "J": values})

@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -228,7 +229,7 @@ class Machine:
         facts = code.facts
         self.layout, self.lanes, self.build = at, lanes, code.build
         self.entries = np.array(facts["entries"], dtype=int).reshape(-1, 2).T
-        self.m, self.nq, self.nv = facts["m"], facts["nq"], facts["nv"]
+        self.m, self.nq, self.nv = facts["m"], facts["nq"], facts["nv"]  # rows, those of wishes with them
         p, i = ctypes.c_void_p, ctypes.c_int64
         self._descend = code.loaded.function("descend", i, p, p, i, i, p, p)
         self._settle: Any = code.loaded.function("settle", i, p, p, i, i, p, p) if at.along else None
@@ -239,7 +240,7 @@ class Machine:
         return arguments(problem, self.layout, q0=q0, s=s)
 
     def rows(self, q: Array, a: Array) -> Rows:
-        """Residuals (n, m) and Jacobian (n, m, nv) at q (n, nq)."""
+        """Residuals (n, m) and Jacobian (n, m, nv) at q (n, nq), of goals, loops and wishes."""
         q, n = np.ascontiguousarray(q), len(q)
         r, values = np.empty((n, self.m)), np.empty((n, self.entries.shape[1]))
         J = np.zeros((n, self.m, self.nv))
@@ -277,24 +278,28 @@ def structure(problem: Problem) -> str | None:
     """Name of everything that the compiled code of a problem depends on; None when it cannot be compiled."""
     if not (expressible(problem) and (problem.wished is None or expressible(problem.wished))):
         return None
-    model = problem.model
+    wished = problem.wished
+    rows = [problem.moved, np.isfinite(problem.tolerance), problem.band > 0]
+    rows += [] if wished is None else [np.isfinite(wished.tolerance), wished.band > 0]
+    goals = [words(g) for g in (*problem.goals, *(() if wished is None else wished.goals))]
+    loops = [(loop.label, loop.a, loop.b) for loop in problem.loops]
+    text = repr((len(problem.goals), goals, loops, problem.model.nq, problem.model.nv, _source()))
+    return key_of(text, *numbers(problem.model), *(x.tobytes() for x in rows))
+
+
+def numbers(model: mujoco.MjModel) -> list[bytes]:
+    """Everything in a model that its kinematics, masses and equalities follow from."""
     arrays = [
         model.jnt_type, model.jnt_pos, model.jnt_axis, model.jnt_limited, model.jnt_bodyid,
         model.body_parentid, model.body_pos, model.body_quat, model.body_ipos, model.body_mass,
         model.body_mocapid, model.qpos0, model.site_bodyid, model.site_pos, model.site_quat,
         model.geom_bodyid, model.geom_pos, model.geom_quat, model.cam_bodyid, model.cam_pos, model.cam_quat,
-        model.eq_type, model.eq_obj1id, model.eq_obj2id, model.eq_objtype, model.eq_data,
-        problem.moved, np.isfinite(problem.tolerance), problem.band > 0,
+        model.eq_type, model.eq_obj1id, model.eq_obj2id, model.eq_objtype, model.eq_data, model.eq_active0,
     ]  # fmt: skip
-    wished = problem.wished
-    arrays += [] if wished is None else [np.isfinite(wished.tolerance), wished.band > 0]
-    goals = [_words(g) for g in (*problem.goals, *(() if wished is None else wished.goals))]
-    loops = [(loop.label, loop.a, loop.b) for loop in problem.loops]
-    words = repr((len(problem.goals), goals, loops, model.nq, model.nv, _source()))
-    return key_of(words, model.names, *(np.ascontiguousarray(x).tobytes() for x in arrays))
+    return [model.names, *(x.tobytes() for x in arrays)]
 
 
-def _words(goal: Goal) -> list[str | tuple[str, ...]]:
+def words(goal: Goal) -> list[str | tuple[str, ...]]:
     """A goal without its numbers: its kind, and the names it gives in order."""
     own = [getattr(goal, key) for key in goal.__dataclass_fields__ if key != "name"]
     names = [x for x in own if isinstance(x, str) or (isinstance(x, tuple) and x and isinstance(x[0], str))]
@@ -333,7 +338,7 @@ def _source_of(problem: Problem, at: Layout, lanes: int) -> tuple[str, str, dict
     loops = head + more + declare("f", step) + declare("g", rows)
     loops += descend_loop(at, lanes) + map_function("map", "g", rows, lanes)
     loops += settle_loop(at, lanes) if at.along else ""
-    facts = {"entries": entries, "m": problem.m, "nq": nq, "nv": problem.space.nv}
+    facts = {"entries": entries, "m": rows.outputs["r"], "nq": nq, "nv": problem.space.nv}
     return head + kernel("f", step, lanes) + kernel("g", rows, lanes), loops, facts_of(step) | facts
 
 

@@ -18,7 +18,7 @@ from ....models.naming import lookup
 from ...compile.graph import Node, Scalar, maximum, sqrt
 from ...kinds import BALL, FREE, HINGE, SLIDE
 from ...kinematics import Frame
-from ..goals import Distance, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from ..goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
 from ..loops import CONNECT, JOINT, Closure
 from ..space import Space
 from ..wholes import CenterOfMass, JointValue, Posture, scalar_joint
@@ -374,7 +374,12 @@ def _shares(goal: Any) -> Array:
 
 def expressible(problem: Problem) -> bool:
     """Whether every goal is of a kind known here and makes sense; a goal of a user's own class is not."""
-    return all(type(goal) in _known() and _sound(goal) for goal in problem.goals)
+    return all(is_known(goal) and _sound(goal) for goal in problem.goals)
+
+
+def is_known(goal: Goal) -> bool:
+    """Whether a goal's kind is known here."""
+    return type(goal) in _known()
 
 
 def _sound(goal: Any) -> bool:

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 _LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
 _STALL = 8  # iterations without progress that end an attempt
 _PROGRESS = 0.99
+_SHARP = 1e-12  # weighted residuals below this are met to rounding
 
 
 class Descent(NamedTuple):
@@ -164,6 +165,8 @@ def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
     x, columns = q[None], np.flatnonzero(problem.moved)
     w = problem.weighted(problem.raw(x))
     for _ in range(steps if len(columns) else 0):
+        if np.abs(w.r).max(initial=0.0) < _SHARP:
+            break
         J, _ = held_projection(problem, x, np.zeros((1, problem.space.nv)), w.J)
         d = np.zeros(problem.space.nv)
         d[columns] = -np.linalg.lstsq(J[0][:, columns], w.r[0], rcond=1e-9)[0]

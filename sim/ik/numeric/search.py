@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,8 @@ class Search:
     """One search over starts: what it found, what came nearest, and what it cost.
 
     Attributes:
-        best: the nearest ends so far, nearest first (at most 12).
         used, iterations: random starts and iterations so far.
-            ends: costs of all attempts that failed.
+        ends: costs of all attempts that failed.
         hopeless: asked once after the first starts; if it says so, few more are tried, for the nearest pose.
     """
 
@@ -36,13 +36,10 @@ class Search:
         hopeless: Callable[[], bool] | None = None,
     ):
         self.problem, self.start, self.restarts, self.hopeless = problem, start, restarts, hopeless
-        self.rng = np.random.default_rng(seed)
         self.used = self.iterations = 0
         self.ends: list[float] = []
-        m = problem.m
-        self.best = Descent(
-            np.zeros((0, problem.space.nq)), np.zeros((0, m)), np.zeros(0), 0, np.zeros(0, dtype=bool)
-        )
+        self._seed = seed
+        self._all: list[Descent] = []
 
     def solutions(self, first: Array) -> Array:
         """Configurations (k, nq) that meet the problem: from `first` (k, nq), the start, then random starts.
@@ -93,14 +90,24 @@ class Search:
         end = descend(self.problem, q, first=first, iterations=iterations)
         self.iterations += end.iterations
         self.ends += end.cost[~end.met].tolist()
-        self._remember(end)
+        self._all.append(end)
         return end.q[end.met]
 
-    def _remember(self, end: Descent) -> None:
-        both = [np.concatenate(pair) for pair in zip(self.best[:3], end[:3], strict=True)]
-        met = np.concatenate([self.best.met, end.met])
-        order = np.argsort(both[2], kind="stable")[:12]
-        self.best = Descent(both[0][order], both[1][order], both[2][order], 0, met[order])
+    @property
+    def best(self) -> Descent:
+        """The nearest ends so far, nearest first (at most 12)."""
+        if len(self._all) > 1:
+            q, r, cost, met = (np.concatenate([end[k] for end in self._all]) for k in (0, 1, 2, 4))
+            self._all = [Descent(q, r, cost, 0, met)]
+        end = self._all[0]
+        order = np.argsort(end.cost, kind="stable")[:12]
+        self._all = [Descent(end.q[order], end.r[order], end.cost[order], 0, end.met[order])]
+        return self._all[0]
+
+    @cached_property
+    def rng(self) -> np.random.Generator:
+        """Where random starts come from."""
+        return np.random.default_rng(self._seed)
 
     def agreed(self) -> int:
         """How many failed attempts ended as near as the nearest, within 0.1 %."""

@@ -62,6 +62,15 @@ def settle(problem: Problem, q: Array, wish: Wish, *, iterations: int = 60) -> S
     return Settled(x[0], value, done)
 
 
+def worth(problem: Problem, q: Array, start: Array, faint: float) -> Array:
+    """Value (k,) of the wishes beside a problem and of nearness to `start` (nq,) at q (k, nq)."""
+    far = problem.space.difference(q, start)[:, problem.moved]
+    value = faint**2 * np.sum(far * far, axis=1)
+    if problem.wished is not None:
+        value += np.sum(problem.wished.weighted(problem.beside(q)).r ** 2, axis=1)
+    return np.asarray(value)
+
+
 def _share(share: float, before: Array, step: Array) -> float:
     """What to take of a step after `share` of the one before (Barzilai & Borwein 1988; see `iteration`)."""
     square = float(before @ before)
@@ -79,14 +88,16 @@ def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: 
     if quick is None or not quick.machine.layout.along:
         return [settle(problem, x, wish) for x in q]
     machine = quick.machine
-    first = np.sum(wish(q).r ** 2, axis=1)
+    first = worth(problem, q, start, faint)
     far = machine.settle(q, machine.arguments(problem, q0=start, s=faint**2))
-    end = descend(problem, far.q, iterations=8)
-    last = np.sum(wish(end.q).r ** 2, axis=1)
-    rest = far.step < (_REST if problem.wished is None else _REST / faint)
-    fine = rest & end.met & (far.worst < 1e-2) & (last <= first * (1 + 1e-9) + 1e-12)
+    fine = (far.step < _REST / faint) & (far.worst < 1e-2) & (far.value <= first * (1 + 1e-9) + 1e-12)
+    x, value = far.q, far.value
+    if (far.worst[fine] > 1e-6).any():  # wishes that pull hard leave the goals open by rounding
+        x = descend(problem, far.q, iterations=8).q
+        value = worth(problem, x, start, faint)
+    fine &= problem.met(problem.raw(x).r)
     return [
-        Settled(end.q[i], float(last[i]), int(far.iterations[i])) if fine[i] else settle(problem, q[i], wish)
+        Settled(x[i], float(value[i]), int(far.iterations[i])) if fine[i] else settle(problem, q[i], wish)
         for i in range(len(q))
     ]
 
