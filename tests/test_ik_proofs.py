@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from oracles import ik_cases, ik_planar
-from pantograph.sim.ik import Distance, PointOnLine, PointOnPlane, Position, solve
+from pantograph.models import ModelError, load_model
+from pantograph.sim import rotations
+from pantograph.sim.ik import (
+    CenterOfMass,
+    Distance,
+    LookAt,
+    Mirror,
+    PointOnLine,
+    PointOnPlane,
+    Position,
+    solve,
+)
 from pantograph.sim.ik.chains.closed_form import closed_form
 from pantograph.sim.ik.pose import Kinematics
 from pantograph.sim.ik.problem import Problem
@@ -79,6 +90,105 @@ def test_no_proof_excludes_what_some_configuration_has(model, seed):
     assert max(gap.position, gap.rotation) < 1e-7
 
 
+@settings(max_examples=150, deadline=None)
+@given(trees(), seeds)
+def test_no_proof_excludes_a_centre_of_mass_a_mirror_image_or_a_sight_that_some_configuration_has(
+    model, seed
+):
+    rng = np.random.default_rng(seed)
+    model = _limited(model, rng)
+    space, kinematics = Space(model), Kinematics(model)
+    start = space.clip(model.qpos0[None])[0]
+    q = space.random(rng, 1, start, np.ones(model.nv, dtype=bool))[0]
+    a, b, base = (f"s{k}" for k in rng.integers(0, model.nsite, 3))
+    (p, quat), other = ik_cases.pose_of(model, q, a), ik_cases.pose_of(model, q, b)[0]
+    axis, far = rng.normal(size=3), rng.uniform(0.1, 5)
+    R = rotations.to_matrix(quat)
+    goals = [LookAt(a, p + far * R @ axis, axis)]
+    if np.linalg.norm(p - other) > 1e-6:  # the mirror plane halfway between two points
+        goals.append(Mirror(a, b, p - other, 0.5 * (p + other)))
+        seen = Mirror(a, b, axis, other, relative_to=base).rows(kinematics.at(q[None])).r[0]
+        at = np.linalg.inv(kinematics.frame(base).pose(q)) @ np.append(p, 1.0)
+        of = np.linalg.inv(kinematics.frame(base).pose(q)) @ np.append(other, 1.0)
+        assert np.isfinite(seen).all()
+        goals.append(Mirror(a, b, (at - of)[:3], 0.5 * (at + of)[:3], relative_to=base))
+    try:
+        center = kinematics.at(q[None]).center_of_mass()[0][0]
+        free = np.add(center, [0, 0, rng.normal()])
+        goals += [CenterOfMass(center), CenterOfMass(free, tolerance=(1e-6, 1e-6, np.inf))]
+    except ModelError:  # nothing that moves has mass
+        pass
+    for goal in goals:
+        problem = Problem(model, [goal], space)
+        gap = goal_gap(problem, goal, start)
+        assert max(gap.position, gap.rotation) < 1e-7, goal
+        assert not subdivision(problem, start, boxes=1500)
+
+
+def _balls(lengths):
+    """A chain of ball joints of uniform rods, its root above the origin: its centre of mass fills a ball."""
+    offsets = [[0, 0, 1], *([length, 0, 0] for length in lengths)]
+    links = [(offset, ik_cases.BALL, (0, 0, 1), None) for offset in offsets[:-1]]
+    return ik_cases.chain([*links, (offsets[-1], None, None, None)])
+
+
+def test_a_centre_of_mass_out_of_reach_is_proved_by_what_a_stretched_chain_reaches():
+    model = _balls((0.5, 0.4, 0.3))
+    q = model.qpos0.copy()
+    stretched = Kinematics(model).at(q[None]).center_of_mass()[0][0]  # along x from (0, 0, 1)
+    longest = np.linalg.norm(stretched - [0, 0, 1])
+    rng = np.random.default_rng(0)
+    for beyond in (1e-4, 0.05, 1.0):
+        way = ik_cases.unit(rng)
+        verdict = solve(model, CenterOfMass([0, 0, 1] + (longest + beyond) * way)).verdict
+        assert (verdict.kind, verdict.proved) == ("out of reach", True)
+        assert verdict.bound == pytest.approx(beyond, abs=1e-9)
+        assert verdict.position == pytest.approx(beyond, abs=1e-6)
+        assert solve(model, CenterOfMass([0, 0, 1] + (longest - beyond / 10) * way)).solved
+    free = (1e-6, 1e-6, np.inf)  # over a line: the height is free
+    verdict = solve(model, CenterOfMass([longest + 0.1, 0, 7], tolerance=free)).verdict
+    assert (verdict.kind, verdict.proved) == ("out of reach", True)
+    assert verdict.bound == pytest.approx(0.1, abs=1e-9)
+
+
+def test_mirror_images_and_sights_out_of_reach_are_proved():
+    spec = mujoco.MjSpec()
+    for side in (1, -1):
+        body = spec.worldbody
+        for i in range(2):
+            body = body.add_body(name=f"b{side}{i}", pos=[0, 0.5 * side, 0] if i == 0 else [0.4, 0, 0])
+            body.add_joint(name=f"j{side}{i}", axis=[0, 0, 1])
+            body.add_geom(size=[0.02, 0, 0])
+        body.add_site(name=f"hand{side}", pos=[0.3, 0, 0])
+    model = spec.compile()
+    assert solve(model, Mirror("hand1", "hand-1")).solved
+    verdict = solve(model, Mirror("hand1", "hand-1", point=[0, 1.2, 0])).verdict
+    assert (verdict.kind, verdict.proved) == ("out of reach", True)
+    assert verdict.bound == pytest.approx(2.4 - 1.4, abs=1e-9)  # shoulder to mirrored shoulder, two arms long
+    assert verdict.position == pytest.approx(2.4 - 1.4, abs=1e-6)
+    seen = [5.0, 0.5, 1.0]  # the arm turns in a plane; what it looks at is above
+    verdict = solve(model, LookAt("hand1", seen, axis=[1, 0, 0])).verdict
+    assert (verdict.kind, verdict.proved) == ("out of reach", True)
+    away = 5.0 + 0.4 - 0.3  # the upper arm leads away, the forearm points back at what it sees
+    assert verdict.rotation == pytest.approx(np.arctan2(1.0, away), abs=1e-6)
+
+
+def test_a_sight_held_by_limits_is_proved_by_subdivision():
+    links = [
+        ([0, 0, 1], ik_cases.HINGE, (0, 0, 1), (-0.5, 0.5)),
+        ([0, 0, 0.1], ik_cases.HINGE, (0, 1, 0), (-0.4, 0.4)),
+    ]
+    model = ik_cases.chain([*links, ([0.1, 0, 0.05], None, None, None)])
+    for angle, solved in ((0.4, True), (0.7, False)):
+        seen = [4 * np.cos(angle), 4 * np.sin(angle), 1.15]
+        solution = solve(model, LookAt("tip", seen, axis=[1, 0, 0]))
+        assert solution.solved == solved
+        if not solved:
+            verdict = solution.verdict
+            assert (verdict.kind, verdict.proved) == ("held by limits", True)
+            assert verdict.rotation == pytest.approx(angle - 0.5, abs=0.01)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_bounds_of_planar_arms_are_attained(seed):
     rng = np.random.default_rng(seed)
@@ -138,8 +248,6 @@ def test_values_beyond_a_turn_are_proved_only_when_nothing_has_them():
 
 def test_limits_of_a_wrist_arm_are_proved_by_its_closed_form():
     """All eight solutions known: a range around none of them."""
-    from pantograph.models import load_model
-
     model = load_model("arm6")
     q = np.array([0.4, 0.3, -0.7, 0.5, 0.8, -0.3])
     p, quat = ik_cases.pose_of(model, q, "tip")

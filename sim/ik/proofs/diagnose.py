@@ -14,6 +14,7 @@ from ..numeric.search import Search
 from ..numeric.settle import settle
 from ..problem import Problem, freedom_names, unwound
 from ..verdict import Verdict
+from ..wholes import CenterOfMass
 from .gaps import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
 
 Array = NDArray[np.float64]
@@ -63,7 +64,8 @@ def excluded(problem: Problem, q: Array) -> bool:
 def _exceeds(gap: Gap, *goals: Goal) -> bool:
     """Whether a proved gap is larger than the goals' tolerances allow."""
     room = sum(float(np.linalg.norm(t[np.isfinite(t)])) for t in (g.tolerances() for g in goals))
-    free = any(not np.isfinite(g.tolerances()).all() for g in goals)
+    seen = (CenterOfMass,)  # gaps of these leave free rows out
+    free = any(not np.isfinite(g.tolerances()).all() and not isinstance(g, seen) for g in goals)
     return not free and (gap.position > room or gap.rotation > room)
 
 

@@ -12,10 +12,11 @@ from ... import rotations
 from ...kinds import HINGE, SLIDE
 from ...kinematics import Frame
 from ..chains.closed_form import ClosedForm
-from ..goals import Distance, Goal, LookAt, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from ..goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
 from ..problem import Problem
-from ..wholes import JointValue, scalar_joint
-from .reach import at_point, offset, path, placed, planar, reach, turning_gap
+from ..wholes import CenterOfMass, JointValue, scalar_joint
+from .balls import mass_gap, mirror_gap, sight_gap
+from .reach import at_point, offset, path, reach, turning_gap
 
 Array = NDArray[np.float64]
 _BOXES = 40_000
@@ -50,6 +51,12 @@ def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
         position, by = (0.0 if hops is None else reach(hops).gap(goal.distance)), "the reach of the chain"
     if isinstance(goal, (PointOnPlane, PointOnLine)):
         position, by = _surface_gap(problem, goal, q), "the reach of the chain"
+    if isinstance(goal, CenterOfMass):
+        position, by = mass_gap(problem, goal, q), "the lengths and masses of the links"
+    if isinstance(goal, Mirror):
+        position, by = mirror_gap(problem, goal, q), "the reach of both chains"
+    if isinstance(goal, LookAt):
+        rotation, by = sight_gap(problem, goal, q), "the axes of the chain"
     if isinstance(goal, JointValue):
         _, v = scalar_joint(problem.kinematics, goal.joint)
         low, high = problem.space.low[v], problem.space.high[v]
@@ -203,7 +210,7 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
         return True
     if problem.loops or not 1 <= len(columns) <= 4 or not np.isfinite([low, high]).all():
         return False
-    rates = [rate for g in problem.goals if (rate := _rates(problem, g, columns)) is not None]
+    rates = [rate for g in problem.goals if (rate := _rates(problem, g, columns, q0)) is not None]
     if len(rates) < len(problem.goals):
         return False
     centre, half = 0.5 * (low + high)[None], 0.5 * (high - low)[None]
@@ -220,6 +227,7 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
             position, rotation = goal.errors(r[:, group.rows])
             room = half @ rate
             slack = np.linalg.norm(np.where(np.isfinite(goal.tolerances()), goal.tolerances(), 0.0))
+            slack *= 0.5 * np.pi if isinstance(goal, LookAt) else 1.0  # angles of sights by their chords
             alive &= (position <= room[:, 0] + slack) & (rotation <= room[:, 1] + slack)
         centre, half = centre[alive], half[alive]
         if not len(centre):
@@ -239,28 +247,58 @@ def _whole_turns(problem: Problem, columns: NDArray[np.intp], low: Array, high: 
     return np.where(hinge & ~np.isfinite(low), -np.pi, low), np.where(hinge & ~np.isfinite(high), np.pi, high)
 
 
-def _rates(problem: Problem, goal: Goal, columns: NDArray[np.intp]) -> Array | None:
+def _rates(problem: Problem, goal: Goal, columns: NDArray[np.intp], q0: Array) -> Array | None:
     """Bounds (k, 2) on how fast the goal's metres and radians change with each joint, or None."""
-    if not isinstance(goal, (Position, Orientation, Pose, Distance, JointValue)):
-        return None
-    out = np.zeros((len(columns), 2))
     if isinstance(goal, JointValue):
+        out = np.zeros((len(columns), 2))
         out[columns == scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
         return out
-    if getattr(goal, "relative_to", None) is not None:
+    if isinstance(goal, CenterOfMass):
+        masses = problem.kinematics.masses()
+        parts = [(mass, _frame_rates(problem, f, columns)) for mass, f in masses]
+        rates = [mass * rate for mass, rate in parts if rate is not None]
+        if len(rates) < len(parts):
+            return None
+        whole = sum(mass for mass, _ in masses)
+        return np.asarray(np.sum(rates, axis=0) / whole * [1.0, 0.0])
+    known = (Position, Orientation, Pose, Distance, Mirror, LookAt)
+    if not isinstance(goal, known) or getattr(goal, "relative_to", None) is not None:
         return None
-    for text in goal.frames():
-        f = problem.kinematics.frame(text)
-        for k, joint in enumerate(f.joints):
-            if joint.v not in columns:
-                continue
-            row = int(np.flatnonzero(columns == joint.v)[0])
-            if int(joint.type) == SLIDE:
-                out[row, 0] += 1.0
-                continue
-            if int(joint.type) != HINGE:
-                return None
+    found = [_frame_rates(problem, problem.kinematics.frame(text), columns) for text in goal.frames()]
+    out = np.zeros((len(columns), 2))
+    for rate in found:
+        if rate is None:
+            return None
+        out += rate
+    if isinstance(goal, LookAt):  # the axis turns with the frame, the sight by the way over the distance
+        near = _nearest_sight(problem, goal, q0)
+        if near <= 0:
+            return None
+        out[:, 1] += out[:, 0] / near
+        out[:, 0] = 0.0
+    return out
+
+
+def _nearest_sight(problem: Problem, goal: LookAt, q0: Array) -> float:
+    """Least distance of a frame from what it looks at [m]."""
+    base = at_point(np.asarray(goal.target), problem.space.nq, problem.space.nv)
+    hops = path(base, problem.kinematics.frame(goal.at), problem.space, problem.moved, q0)
+    return 0.0 if hops is None else reach(hops).low
+
+
+def _frame_rates(problem: Problem, f: Frame, columns: NDArray[np.intp]) -> Array | None:
+    """Bounds (k, 2) on how fast a frame moves [m] and turns [rad] with each joint; None with balls on it."""
+    out = np.zeros((len(columns), 2))
+    for k, joint in enumerate(f.joints):
+        if joint.v not in columns:
+            continue
+        row = int(np.flatnonzero(columns == joint.v)[0])
+        if int(joint.type) == SLIDE:
+            out[row, 0] += 1.0
+        elif int(joint.type) == HINGE:
             out[row] += [_farthest(problem, f, k), 1.0]
+        else:
+            return None
     return out
 
 
@@ -273,16 +311,3 @@ def _farthest(problem: Problem, f: Frame, k: int) -> float:
             span = problem.space.low[joint.v] - joint.rest, problem.space.high[joint.v] - joint.rest
             total += max(abs(span[0]), abs(span[1]))
     return total
-
-
-__all__ = [
-    "Gap",
-    "LookAt",
-    "closed_form_outside",
-    "goal_gap",
-    "pair_gap",
-    "pairs",
-    "placed",
-    "planar",
-    "subdivision",
-]  # fmt: skip

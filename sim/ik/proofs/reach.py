@@ -127,7 +127,7 @@ def path(a: Frame, b: Frame, space: Space, moved: NDArray[np.bool_], q: Array) -
         if i.q != j.q:
             break
         shared += 1
-    half_a, half_b = (_hops(f, f.joints[shared:], space, moved, q) for f in (a, b))
+    half_a, half_b = (hops_of(f, f.joints[shared:], space, moved, q) for f in (a, b))
     if half_a is None or half_b is None:
         return None
     (first_a, rest_a, turns_a), (first_b, rest_b, turns_b) = half_a, half_b
@@ -141,10 +141,11 @@ def path(a: Frame, b: Frame, space: Space, moved: NDArray[np.bool_], q: Array) -
     return Path((*turned, middle, *rest_b), (*inward, *turns_b))
 
 
-def _hops(
+def hops_of(
     f: Frame, joints: tuple[Any, ...], space: Space, moved: NDArray[np.bool_], q: Array
 ) -> tuple[Hop, list[Hop], list[Turn]] | None:
-    """First hop (from the common frame's origin), the others, and the joints between them."""
+    """First hop to `f` from the common frame's origin, the others, and the turning joints between; None
+    with a free joint."""
     hops: list[Hop] = []
     turns: list[Turn] = []
     T, travels, start = np.eye(4), [], None
