@@ -23,16 +23,18 @@ from .errors import EngineError
 from .integrate import TABLEAUS
 from .integrate.problems import constraints_of
 from .plan import Plan
-from .work_precision import Case, Motion, Reference, trajectory_error
+from .work_precision import TOLERANCES, Case, Motion, Reference, trajectory_error
 
 FRAMES = 50
+TIGHT = 1e-12
+"""Tolerance of the smooth engine's reference."""
 FINEST = {"smooth": "dop853", "contact": "rk4"}
 """The method of each engine's reference."""
 
 
 @dataclass(frozen=True, eq=False)
-class SceneSteps:
-    """One method of one engine on a scene, by fixed steps (see `work_precision.Runner`)."""
+class SceneWork:
+    """One method of one engine on a scene, by fixed steps or by tolerance (see `work_precision.Runner`)."""
 
     plan: Plan
     case: Case
@@ -41,16 +43,25 @@ class SceneSteps:
     knob: str = "step"
 
     def settings(self) -> Iterable[float]:
-        """The controller's period, or a frame's time, and its halves."""
+        """The controller's period, or a frame's time, and its halves; or tolerances."""
+        if self.knob == "tolerance":
+            return TOLERANCES
         longest = self.plan.period or self.case.duration / self.case.frames
         return [longest / 2**k for k in range(12)]
 
     def run(self, setting: float) -> Motion:
-        """The motion of the scene in steps of `setting` [s]."""
+        """The motion of the scene in steps of `setting` [s], or to that tolerance."""
         plan, case = self.plan, self.case
-        every = round(case.duration / case.frames / setting)
+        by_steps = self.knob == "step"
+        # what friction is smoothed over follows from the step, also where it is no step
+        step = setting if by_steps else (plan.period or case.duration / case.frames) / 2**6
         problem = replace(
-            plan.problem, step=setting, integrator=self.method, sample_every=every, duration=case.duration
+            plan.problem,
+            step=step,
+            tolerance=None if by_steps else setting,
+            integrator=self.method,
+            sample_every=round(case.duration / case.frames / step),
+            duration=case.duration,
         )
         controls = None
         if plan.period is not None:
@@ -89,35 +100,42 @@ def is_free(plan: Plan) -> bool:
     return not (keyed or driven or constraints_of(problem.model))
 
 
-def scene_runners(plan: Plan, case: Case) -> tuple[list[SceneSteps], list[str]]:
+def scene_runners(plan: Plan, case: Case) -> tuple[list[SceneWork], list[str]]:
     """All methods of the engines that can run the scene, and why an engine cannot."""
-    found: list[SceneSteps] = []
+    found: list[SceneWork] = []
     notes = []
     for engine, methods in (("smooth", TABLEAUS), ("contact", INTEGRATORS)):
         if engine == "smooth" and can_touch(plan.problem.model):
             notes.append("no smooth engine: bodies may touch; without contacts it could run the scene")
             continue
-        trial = SceneSteps(plan, case, engine, FINEST[engine])
+        trial = SceneWork(plan, case, engine, FINEST[engine])
         try:
             trial.run(next(iter(trial.settings())))
         except EngineError as error:
             notes.append(f"no {engine} engine: {error}")
         else:
-            found += [SceneSteps(plan, case, engine, name) for name in methods]
+            found += [SceneWork(plan, case, engine, name) for name in methods]
+            if engine == "smooth":
+                pairs = [name for name, tableau in TABLEAUS.items() if tableau.adaptive]
+                found += [SceneWork(plan, case, engine, name, "tolerance") for name in pairs]
     return found, notes
 
 
 def scene_references(
     engines: Iterable[str], plan: Plan, case: Case, *, budget_s: float
 ) -> dict[str, Reference]:
-    """The reference of each engine: steps that halve until two runs agree to 1e-10, or one costs `budget_s`.
+    """The reference of each engine: two methods at a tight tolerance, where it has any; or steps that halve
+    until two runs agree to 1e-10, or one costs `budget_s`.
 
     Raises:
         EngineError: a reference did not reach the end.
     """
     references = {}
     for engine in engines:
-        runner = SceneSteps(plan, case, engine, FINEST[engine])
+        if engine == "smooth" and (found := _by_tolerance(plan, case)):
+            references[engine] = found
+            continue
+        runner = SceneWork(plan, case, engine, FINEST[engine])
         settings = list(runner.settings())
         before, uncertainty, step = runner.run(settings[1]), float("nan"), settings[1]
         for step in settings[2:]:
@@ -134,3 +152,13 @@ def scene_references(
         source = f"{engine} engine, {runner.method} at {step:.3g} s; uncertainty by twice that step"
         references[engine] = Reference(before, uncertainty, source)
     return references
+
+
+def _by_tolerance(plan: Plan, case: Case) -> Reference | None:
+    """The smooth engine's reference; None where a method does not reach the end."""
+    names = ("verner98", "dop853")
+    motions = [SceneWork(plan, case, "smooth", name, "tolerance").run(TIGHT) for name in names]
+    uncertainty = trajectory_error(case, *motions)
+    if not np.isfinite(uncertainty):
+        return None
+    return Reference(motions[0], uncertainty, f"smooth engine, verner98 to {TIGHT:g}; uncertainty by dop853")

@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,11 @@ from .loops import declare, map_function
 from .tape import Tape
 
 Array = NDArray[np.float64]
+
+
+RECENT = 64  # programs kept in memory: loading one and letting it go costs 10 ms
+_recent: dict[tuple[Path | None, str], Code] = {}
+_lock = Lock()
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,25 @@ def obtain(
 ) -> Code:
     """The code of `key` from disk, or by `make`, which gives kernels, loops (IR) and facts to keep.
 
-    `facts` needs "operations" and "cost".
+    `facts` needs "operations" and "cost". What this process used last is still in memory.
     """
+    begin = time.perf_counter()
+    known = _recent.get((cache.folder, key))
+    if known is not None:
+        build = Build(name, lanes, True, known.build.operations, 0.0, 0.0, time.perf_counter() - begin)
+        return Code(known.loaded, known.facts, build)
+    code = _found_or_made(name, lanes, cache, key, make)
+    if cache.folder is not None:
+        with _lock:
+            while len(_recent) >= RECENT:
+                del _recent[next(iter(_recent))]
+            _recent[cache.folder, key] = code
+    return code
+
+
+def _found_or_made(
+    name: str, lanes: int, cache: Cache, key: str, make: Callable[[], tuple[str, str, dict[str, Any]]]
+) -> Code:
     entry = cache.get(key)
     begin = time.perf_counter()
     if entry is not None:

@@ -64,11 +64,13 @@ class AdaptiveRun(Run):
             )  # fmt: skip
             self.evaluations += reached.evaluations
             self.done += reached.steps
-            for t, x in zip(self.records[reached.first :], reached.records, strict=False):
-                self.keep(float(t), *c.spread(x, c.at(np.array([t]))[0]))
+            times = self.records[reached.first : reached.first + len(reached.records)]
+            w = c.at(np.append(times, reached.t))
+            for t, x, row in zip(times, reached.records, w, strict=False):
+                self.keep(float(t), *c.spread(x, row))
             self.offset, self.next_step = reached.t, reached.h
             self.jumped = reached.t == begun or reached.t < stop
-            self.q, self.v, self.act = c.spread(reached.x, c.at(np.array([reached.t]))[0])
+            self.q, self.v, self.act = c.spread(reached.x, w[-1])
             if reached.failed:
                 return f"{reached.failed} at t = {self.now:.4g} s: {self.nonsense() or self._advice()}"
             if reached.guarded:
