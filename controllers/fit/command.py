@@ -8,16 +8,25 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from ...sim.errors import PantographError
 
 console = Console()
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with keyed joints.")]
+WAYS = ("check", "retime", "nearest", "fit")
 
 
 def fit(
     scene: SceneFile,
-    how: Annotated[str, typer.Option(help="check, retime (fastest), nearest (timing), or fit.")] = "check",
+    how: Annotated[
+        str | None,
+        typer.Option(help="check, retime (fastest), nearest (timing), or fit; default: as the scene says."),
+    ] = None,
+    film: Annotated[
+        Path | None, typer.Option(help="Film to write: as keyed on the left, made possible on the right.")
+    ] = None,
     velocity: Annotated[list[str] | None, typer.Option(help="Limit [rad/s, m/s]: 3, or elbow=2.")] = None,
     acceleration: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^2, m/s^2].")] = None,
     jerk: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^3, m/s^3].")] = None,
@@ -25,60 +34,136 @@ def fit(
     top_speed: Annotated[
         list[str] | None, typer.Option(help="Speed where a motor gives nothing more.")
     ] = None,
-    passive: Annotated[list[str] | None, typer.Option(help="Joint without a drive (fit only).")] = None,
+    ampere: Annotated[
+        list[str] | None, typer.Option(help="Current of a joint's drive [A/(N m), A/N].")
+    ] = None,
+    current: Annotated[float | None, typer.Option(help="Current that the battery gives [A].")] = None,
+    passive: Annotated[
+        list[str] | None, typer.Option(help="Joint without a drive, beside free joints.")
+    ] = None,
     hard: Annotated[
         list[float] | None, typer.Option(help="Time of a key to pass through (fit only).")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the recording of the new motion.")] = Path("out"),
+    out: Annotated[Path, typer.Option(help="Folder for the recording, and for bare file names.")] = Path(
+        "out"
+    ),
 ) -> None:
-    """Check the keyed motion of a scene against a machine, or make it possible."""
-    from ...sim.plan import make_plan
-    from ...sim.scene.load import load_scene
-    from .. import fit as fitting
+    """Check the keyed motion of a scene against a machine, or make it possible.
 
-    ways = ("check", "retime", "nearest", "fit")
-    if how not in ways:
-        raise PantographError(f"no way {how!r} to fit; there is: {', '.join(ways)}")
-    plan = make_plan(load_scene(scene))
-    problem = plan.problem
-    driven = _driven(problem.model, passive or [])
-    given = {
-        "velocity": velocity,
-        "acceleration": acceleration,
-        "jerk": jerk,
-        "force": force,
-        "top_speed": top_speed,
-    }
-    limits: dict[str, Any] = {k: _limit(v) for k, v in given.items()}
-    able = fitting.machine(problem.model, driven=driven, **limits)
-    report = fitting.check(problem.clip, able)
-    console.print("as keyed: " + ("possible" if report.possible else "impossible"))
-    for violation in report.violations:
-        console.print(f"  {violation}", soft_wrap=True)
+    Machine and contacts stand in the scene's table [fit]; options go before it.
+    """
+    from ...sim.cli import show
+    from ...sim.plan import make_plan
+    from ...sim.scene.fitting import FitItem
+    from ...sim.scene.load import load_scene
+    from . import Phase, check, machine
+
+    loaded = load_scene(scene)
+    item = loaded.fit or FitItem()
+    how = how or item.how
+    if how not in WAYS:
+        raise PantographError(f"no way {how!r} to fit; there is: {', '.join(WAYS)}")
+    plan = make_plan(loaded)
+    if item.phases:
+        plan = make_plan(_touching(plan))
+    clip, model = plan.problem.clip, plan.problem.model
+    if not clip.end > clip.start:
+        raise PantographError(f"{scene} keys no motion: no joint has two keys")
+    given = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "force": force}
+    given |= {"top_speed": top_speed, "ampere": ampere}
+    limits: dict[str, Any] = {k: _limit(v) if v else getattr(item, k) for k, v in given.items()}
+    most = current or item.current or math.inf
+    able = machine(model, driven=_driven(model, passive or item.passive), current=most, **limits)
+    phases = tuple(Phase(p.start, p.stop, tuple(p.sites), p.friction, p.ground) for p in item.phases)
+    report = check(clip, able, phases=phases)
+    console.print(_table(report, "as keyed"))
+    _advise(report, phases)
     if how == "check":
         raise typer.Exit(0 if report.possible else 1)
     if how == "fit":
-        fitted = fitting.fit(problem.clip, able, hard=hard or [])
-        clip = fitted.clip
+        words = {k: getattr(item, k) for k in ("effort", "deviation", "step", "tolerance", "at_rest")}
+        with show.status(f"fitting {scene.stem}") as tell:
+            new, good = _fit(clip, able, hard or item.hard, phases, words, tell)
+    else:
+        with show.status(f"retiming {scene.stem}"):
+            new, good = _retime(clip, able, how == "nearest")
+    before, after = _recording(plan, clip), _recording(plan, new)
+    console.print(f"recording: {after.save(out / f'{scene.stem}.fit.npz')}")
+    if film is not None:
+        from ...sim.shoot import shoot
+
+        target = out / film if film.parent == Path() else film
+        with show.film_notes(console):
+            console.print(f"film: {shoot(before, target, beside=after)}, as keyed on the left")
+    raise typer.Exit(0 if good else 1)
+
+
+def _fit(clip: Any, able: Any, hard: Any, phases: Any, words: dict[str, Any], tell: Any) -> tuple[Any, bool]:
+    from . import fit as solve
+    from . import prove
+
+    found = solve(clip, able, hard=hard, phases=phases, progress=tell, **words)
+    console.print(f"fitted: up to {found.deviation:.3g} rad or m from the keys")
+    console.print(str(found.certificate), soft_wrap=True, style="" if found.certificate.holds else "yellow")
+    if tell is not None:
+        tell("simulating")
+    proof = prove(found, able)
+    law = "servos" if phases else "LQR"
+    console.print(
+        f"simulated with contacts and {law} in the loop: within {proof.worst:.3g} rad or m of the fitted "
+        f"motion, drives at their limits {proof.saturated:.0%} of the time",
+        soft_wrap=True,
+    )
+    return found.clip, found.certificate.holds
+
+
+def _retime(clip: Any, able: Any, keep: bool) -> tuple[Any, bool]:
+    from . import retime
+
+    found = retime(clip, able, keep=keep)
+    was = clip.end - clip.start
+    console.print(_table(found.report, "retimed"))
+    console.print(f"retimed: {found.duration:.4f} s, was {was:.4f} s")
+    return found.clip, found.report.possible
+
+
+def _table(report: Any, title: str) -> Table:
+    """Every limit of the machine, the worst first; ranges and missing forces where they are crossed."""
+    verdict = "possible" if report.possible else "impossible"
+    table = Table(title=f"{title}: {verdict}", title_justify="left")
+    for head in ("joint", "what", "largest", "limit", "in use", "at s", "crossed, s"):
+        right = head not in ("joint", "what")
+        table.add_column(head, justify="right" if right else "left", no_wrap=True)
+    for use in report.uses:
+        crossed = use.share > 1.0 + 1e-6
+        value, limit, share = f"{use.value:.4g}", f"{use.limit:.4g}", f"{use.share:.1%}"
+        if use.kind in ("position", "missing force"):
+            if not crossed:
+                continue
+            limit, share = ("no drive", "") if use.kind == "missing force" else ("range", "beyond")
+        ends = f"{use.start:.3f} to {use.stop:.3f}" if crossed else ""
+        row = (escape(use.who), use.kind, value, limit, share, f"{use.t:.3f}", ends)
+        table.add_row(*row, style="red" if crossed else "")
+    return table
+
+
+def _advise(report: Any, phases: Any) -> None:
+    """What to write where a report would puzzle."""
+    if not report.uses:
         console.print(
-            f"fitted, up to {fitted.deviation:.4g} rad or m from the keys: {fitted.certificate}",
+            "[yellow]note:[/] this machine has no limits: give some, as --velocity 3 --force shoulder=10, "
+            "or in the scene's \\[fit]",
             soft_wrap=True,
         )
-        proof = fitting.prove(fitted, able)
+    if not phases and any(v.kind == "missing force" and "." in v.who for v in report.violations):
         console.print(
-            f"simulated with LQR in the loop: within {proof.worst:.3g} rad or m of the fitted motion"
+            "[yellow]note:[/] nothing drives a free joint: what carries it is declared as contacts, "
+            "\\[\\[fit.phases]] with sites, start and stop",
+            soft_wrap=True,
         )
-    else:
-        retimed = fitting.retime(problem.clip, able, keep=how == "nearest")
-        clip = retimed.clip
-        was = problem.clip.end - problem.clip.start
-        console.print(
-            f"retimed: {retimed.duration:.4f} s, was {was:.4f} s; limits in use {retimed.report.worst:.4%}"
-        )
-    console.print(f"recording: {_record(plan, clip, out / f'{scene.stem}.fit.npz')}")
 
 
-def _record(plan: Any, clip: Any, path: Path) -> Path:
+def _recording(plan: Any, clip: Any) -> Any:
     """The motion of a clip as a recording, every joint keyed."""
     from dataclasses import replace
 
@@ -94,26 +179,35 @@ def _record(plan: Any, clip: Any, path: Path) -> Path:
     problem = replace(plan.problem, clip=clip, roles=roles, duration=steps * h, step=h, sample_every=1)
     kinematic = Choice("kinematic", "the motion is known")
     setup = replace(plan.setup, roles=roles, clip=clip)
-    recording = run(replace(plan, setup=setup, problem=problem, engine=kinematic, period=None))
-    return recording.save(path)
+    return run(replace(plan, setup=setup, problem=problem, engine=kinematic, period=None))
+
+
+def _touching(plan: Any) -> Any:
+    """The scene with its joints tracked: between parts that are all keyed a plan leaves contacts out."""
+    from ...models import names_of
+    from ...sim.kinds import FREE
+
+    model, scene = plan.problem.model, plan.setup.scene
+    names = names_of(model, "joint")
+    mine = [n for n in plan.problem.clip.tracks if int(model.jnt_type[names.index(n)]) != FREE]
+    return scene.model_copy(update={"roles": scene.roles.model_copy(update={"tracked": mine, "keyed": []})})
 
 
 def _driven(model: Any, passive: list[str]) -> Any:
-    """Mask (nv,) of the freedoms with a drive."""
+    """Mask (nv,) of the freedoms with a drive: all but those of free joints and of the ``passive`` ones."""
     import numpy as np
 
     from ...models import lookup
+    from ...sim.kinds import FREE
 
-    driven = np.ones(model.nv, dtype=bool)
+    driven = np.asarray(model.jnt_type[model.dof_jntid] != FREE)
     for name in passive:
         driven[model.dof_jntid == lookup(model, "joint", name)] = False
     return driven
 
 
-def _limit(texts: list[str] | None) -> float | dict[str, float] | None:
+def _limit(texts: list[str]) -> float | dict[str, float]:
     """One number for all joints, or one a joint from texts such as elbow=2."""
-    if not texts:
-        return None
     named = {}
     for text in texts:
         name, sign, value = text.rpartition("=")

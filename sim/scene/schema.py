@@ -19,6 +19,7 @@ from pydantic import (
 
 from ..curves import check_kind
 from ..errors import KeyingError
+from .fitting import FitItem
 from .mistakes import report
 from .values import Colour, Finite, NotNegative, Pair, Positive, Quaternion, Row, Switch, Vector, at, plain
 from .words import mistakes_of
@@ -359,6 +360,7 @@ class Scene(Item):
     goals: list[GoalItem] = Field(default_factory=list)
     forces: list[ForceItem] = Field(default_factory=list)
     controller: ControllerItem | None = None
+    fit: FitItem | None = None
     physics: Physics = Physics()
     solver: Solver = Solver()
     cameras: list[CameraItem] = Field(default_factory=list)
