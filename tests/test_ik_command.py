@@ -28,6 +28,14 @@ def test_a_negative_verdict_fails_and_tells_the_distance():
     assert "out of reach" in text and "0.7 m" in text and "proved" in text
 
 
+def test_feet_can_be_held_and_joints_named_by_patterns():
+    words = ("puppet", "--site", "left_hand", "--to", "0.4,0.2,0.9")
+    code, text = _run(*words, "--hold", "left_foot", "--hold", "right_foot")
+    assert code == 0 and "hold left_foot" in text and "root" in text and "left_ankle_pitch" in text
+    code, text = _run("puppet", "--site", "left_hand", "--to", "0.15,0.35,1.0", "--joint", "left_*")
+    assert code == 0 and "left_elbow" in text and "root" not in text and "waist" not in text
+
+
 def test_the_way_can_be_pictured(tmp_path):
     pytest.importorskip("pyrender")
     code, _ = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
@@ -42,6 +50,9 @@ def test_the_way_can_be_pictured(tmp_path):
         (("arm6", "--to", "1,2,a"), "x,y,z"),
         (("puppet", "--to", "1,2,3"), "--site"),
         (("arm6", "--to", "1,0,0", "--site", "tipp"), "tip"),
+        (("arm6", "--to", "nan,0,0"), "finite"),
+        (("arm6", "--to", "1,0,0", "--joint", "x*"), "waist"),
+        (("arm6", "--to", "1,0,0", "--hold", "tipp"), "tip"),
         (("arm6", "--to", "1,0,0", "--keyframe", "none such"), "no keyframe"),
     ],
 )

@@ -22,7 +22,12 @@ def ik(
     model: Annotated[str, typer.Argument(help="Built-in model or model file; see 'pantograph models'.")],
     to: Annotated[str, typer.Option(help="Target: x,y,z [m], or x,y,z,qw,qx,qy,qz.")],
     site: Annotated[str | None, typer.Option(help="Site to bring there; body:NAME for a body.")] = None,
-    joint: Annotated[list[str] | None, typer.Option(help="Joint that may move; default all.")] = None,
+    joint: Annotated[
+        list[str] | None, typer.Option(help="Joint that may move, or a pattern as 'left_*'; default all.")
+    ] = None,
+    hold: Annotated[
+        list[str] | None, typer.Option(help="Site or body:NAME that keeps its pose, as a foot on the ground.")
+    ] = None,
     keyframe: Annotated[str | None, typer.Option(help="Keyframe of the model to start from.")] = None,
     prefer: Annotated[str, typer.Option(help="near, middle or manipulability.")] = "near",
     every: Annotated[bool, typer.Option("--all", help="List all distinct solutions.")] = False,
@@ -38,9 +43,10 @@ def ik(
 
     loaded = load_model(model)
     start = _start(loaded, keyframe)
-    goal = _goal(loaded, site, to)
+    goals = [_goal(loaded, site, to), *(_held(loaded, name, start) for name in hold or [])]
     solution = solve(
-        loaded, goal, q0=start, joints=joint, prefer=prefer, restarts=restarts, seed=seed, all=every  # type: ignore[arg-type]
+        loaded, goals, q0=start, joints=_joints(loaded, joint), prefer=prefer,  # type: ignore[arg-type]
+        restarts=restarts, seed=seed, all=every,
     )  # fmt: skip
     _show(loaded, solution, start)
     if film is not None:
@@ -60,6 +66,33 @@ def _start(model: Any, keyframe: str | None) -> Any:
     return model.key_qpos[names.index(keyframe)]
 
 
+def _joints(model: Any, patterns: list[str] | None) -> list[str] | None:
+    """Names of the joints that names or patterns mean."""
+    from ..scene.names import Names
+
+    if patterns is None:
+        return None
+    names, out = Names(model, "joint"), []
+    by_id = {i: name for name, i in names.ids.items()}
+    for pattern in patterns:
+        found = names.match(pattern)
+        if not found:
+            raise PantographError(names.missing(pattern))
+        out += [by_id[i] for i in found]
+    return out
+
+
+def _held(model: Any, name: str, start: Any) -> Goal:
+    """The goal that a frame stays as it is at the start (nq,)."""
+    from ..ik import Pose
+    from ..ik.pose import parse_frame
+    from ..kinematics import frame
+    from ..rotations import from_matrix
+
+    X = frame(model, *parse_frame(name)).pose(start)
+    return Pose(name, X[:3, 3], from_matrix(X[:3, :3]), name=f"hold {name}")
+
+
 def _goal(model: Any, site: str | None, to: str) -> Goal:
     """The goal of the words of the command line."""
     from ...models import names_of
@@ -69,7 +102,10 @@ def _goal(model: Any, site: str | None, to: str) -> Goal:
     if site is None:
         if len(sites) != 1:
             raise PantographError(
-                f"name the site to move with --site; the model has: {', '.join(sites) or 'none'}"
+                f"name the site to move with --site; the model has: {', '.join(sites)}"
+                if sites
+                else "this model has no sites; name a body to move, as --site "
+                f"body:{names_of(model, 'body')[-1]}; it has: {', '.join(names_of(model, 'body')[1:])}"
             )
         site = sites[0]
     try:
