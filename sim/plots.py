@@ -70,7 +70,7 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
         if event.kind == "contact":
             axes[3].axvline(event.t, color="grey", lw=0.6, alpha=0.5)
     if scalars:
-        axes[0].legend(fontsize=8, ncols=3, loc="best")
+        axes[0].legend(fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
     axes[3].legend(fontsize=8, loc="best")
     for ax in axes:
         ax.grid(alpha=0.3)

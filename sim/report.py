@@ -182,11 +182,24 @@ class Report:
         return folder
 
     def __str__(self) -> str:
+        return self._text(self.rows)
+
+    def brief(self) -> str:
+        """As `str`, with only the rows that no other beats in both error and processor time."""
+        best: list[Row] = []
+        for row in sorted(self.rows, key=lambda row: (row.cpu_s, row.error)):
+            if math.isfinite(row.error) and (not best or row.error < best[-1].error):
+                best.append(row)
+        return self._text(best)
+
+    def _text(self, rows: Sequence[Row]) -> str:
         lines = [self.name]
         lines += [f"Reference: {y.source}; its own error about {y.uncertainty:.1e}." for y in self.yardsticks]
         lines += [f"Note: {note}." for note in self.notes]
+        if len(rows) < len(self.rows):
+            lines.append(f"Of {len(self.rows)} runs those that no other beats in both error and time:")
         lines += ["", f"{'engine':8}{'method':14}{'setting':>20}{'error':>10}{'cpu':>10}{'evaluations':>13}"]
-        for row in self.rows:
+        for row in rows:
             knob = f"{row.knob} {row.setting:.3g}" + (" s" if row.knob == "step" else "")
             error = f"{row.error:.1e}" if math.isfinite(row.error) else "diverged"
             lines.append(

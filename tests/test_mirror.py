@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -271,6 +273,8 @@ def test_recording_of_the_rig_is_a_recording_like_any_other(scene: Scene, tmp_pa
         assert np.abs(mine.q[20:, j] - late[20:]).max() < 0.03
     assert np.abs(mine.v - np.gradient(mine.q, mine.t, axis=0)).max() < 0.5
     assert "delay" in str(report) and report.timing is not None and report.timing.cycles == 101
+    timing = dataclasses.replace(report.timing, histogram=((50.0, 7), (75.0, 0), (np.inf, 2)))
+    assert "cycles by rate: up to 50 Hz 7, above 75 Hz 2\n" in str(dataclasses.replace(report, timing=timing))
 
 
 def test_delay_and_rms_of_a_known_lag() -> None:

@@ -95,6 +95,16 @@ def test_a_recording_without_scalar_joints_shows_its_energies():
     np.testing.assert_array_equal(lines(energy)["kinetic"].get_ydata(), r.kinetic)
 
 
+def test_the_names_of_the_joints_cover_no_curve(recording):
+    chart = figure(recording)
+    chart.canvas.draw()
+    axes = chart.axes[0]
+    legend, inside = axes.get_legend().get_window_extent(), axes.get_window_extent()
+    assert legend.y0 >= inside.y1 - 1
+    assert legend.x1 <= chart.bbox.x1
+    assert legend.y1 <= chart.bbox.y1
+
+
 def test_first_contacts_and_limits_are_marked():
     r = run(Scene(duration=0.5, models=[{"file": "cart_pole"}], initial={"velocity": {"slide": 5}}))
     (limit,) = [e for e in r.events if e.kind == "limit"][:1]

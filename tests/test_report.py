@@ -94,6 +94,21 @@ def row(
     return Row(engine, "dopri5", knob, setting, error, cpu, 0.0, n)
 
 
+def test_a_brief_report_has_the_runs_that_no_other_beats():
+    good = (row("smooth", 1e-4, 1.0, setting=0.1), row("smooth", 1e-7, 5.0, setting=0.2))
+    beaten = (
+        row("mujoco", 1e-7, 50.0, setting=0.3),
+        row("mujoco", 1e-3, 2.0, setting=0.4),
+        row("smooth", np.nan, 0.1, setting=0.5),
+    )
+    report = Report("x", beaten + good, (Yardstick("reference", 1e-8),))
+    shown = [setting for setting in (0.1, 0.2, 0.3, 0.4, 0.5) if f"step {setting:g} s" in report.brief()]
+    assert shown == [0.1, 0.2]
+    assert "Of 5 runs those that no other beats" in report.brief()
+    assert report.recommendation() in report.brief()
+    assert all(f"step {setting:g} s" in str(report) for setting in (0.1, 0.2, 0.3, 0.4, 0.5))
+
+
 def test_recommendation_takes_the_cheapest_that_is_good_enough():
     rows = (
         row("smooth", 1e-4, 1.0),

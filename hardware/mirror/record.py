@@ -103,7 +103,13 @@ class MirrorReport:
                 f"  {self.timing.cycles} cycles, {self.timing.skipped} skipped; jitter {p50:.3f} ms median, "
                 f"{p99:.3f} ms 99 %, {most:.3f} ms greatest; busy {self.timing.busy * 1e3:.2f} ms a cycle"
             )
-            rates = (f"up to {rate:.4g} Hz {n}" for rate, n in self.timing.histogram if n)
+            rates: list[str] = []
+            below = 0.0
+            for rate, n in self.timing.histogram:
+                if n:
+                    band = f"up to {rate:.4g}" if np.isfinite(rate) else f"above {below:.4g}"
+                    rates.append(f"{band} Hz {n}")
+                below = rate
             lines.append(f"  cycles by rate: {', '.join(rates)}")
         s = self.packets
         lines.append(

@@ -219,7 +219,7 @@ def report(
             folder = out / f"{scene.stem}-report"
             reports = (compare(scene, folder, progress=tell),)
     for each in reports:
-        typer.echo(str(each))
+        typer.echo(each.brief())
     console.print(f"report: {folder}")
 
 
