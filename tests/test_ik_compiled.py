@@ -20,7 +20,6 @@ from pantograph.sim.ik import (
     Posture,
     solve,
 )
-from pantograph.sim.ik import problem as problems
 from pantograph.sim.ik.animate import Pole, Spread
 from pantograph.sim.ik.chains import machine as machines
 from pantograph.sim.ik.chains.iteration import arguments, layout, rows_tape
@@ -35,13 +34,7 @@ from strategies import random_states, seeds, trees
 @pytest.fixture
 def plain(monkeypatch):
     """Everything in NumPy."""
-    monkeypatch.setattr(problems, "structure", lambda problem: None)
-
-
-@pytest.fixture
-def eager(monkeypatch):
-    """Everything compiled at once."""
-    monkeypatch.setattr(machines, "_expected", lambda problem: -1.0)
+    monkeypatch.setattr(Problem, "prepared", lambda self, **_: None)
 
 
 def machine_of(problem):
@@ -252,7 +245,7 @@ def test_answers_are_the_same_with_and_without_machine_code(monkeypatch):
     monkeypatch.setattr(machines, "_expected", lambda problem: -1.0)
     for model, goals in _questions():
         with monkeypatch.context() as without:
-            without.setattr(problems, "structure", lambda problem: None)
+            without.setattr(Problem, "prepared", lambda self, **_: None)
             slow = solve(model, goals, restarts=40)
         quick = solve(model, goals, restarts=40)
         assert (quick.verdict.kind, quick.verdict.proved) == (slow.verdict.kind, slow.verdict.proved)

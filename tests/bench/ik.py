@@ -1,6 +1,7 @@
 """Inverse kinematics: speed beside mink and pink, verdicts against known truths, motion, closed loops.
 
-`make bench NAME=ik`, or `python tests/bench/ik.py [part ...]` with parts protocol, verdicts, motion, loops.
+`make bench NAME=ik`, or `python tests/bench/ik.py [part ...]` with parts protocol, goals,
+verdicts, motion, loops.
 """
 
 import json
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -18,6 +19,8 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from arms import bare, panda, ur5  # noqa: E402
+from ik_figures import at_least, at_most, told  # noqa: E402
+from ik_goals import several  # noqa: E402
 from oracles import ik_cases, ik_loops  # noqa: E402
 from oracles.ik_motions import figure_eight, walk, wrist_arm  # noqa: E402
 from pantograph.models import data_robots, load_model  # noqa: E402
@@ -34,29 +37,6 @@ TOLERANCE = 1e-5
 RANDOM_TARGETS, PEER_TARGETS, CASES = 10_000, 200, 1000
 ENVIRONMENT = HERE.parents[1] / ".bench" / "ik"
 PACKAGES = ("mink", "pin-pink", "daqp", "qpsolvers", "mujoco>=4")
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One measured number and the bar it must reach (None: told, not judged)."""
-
-    name: str
-    value: float
-    unit: str
-    bar: str
-    holds: bool | None
-
-
-def at_most(name, value, bar, unit):
-    return Figure(name, float(value), unit, f"<= {bar:g}", bool(value <= bar))
-
-
-def at_least(name, value, bar, unit):
-    return Figure(name, float(value), unit, f">= {bar:g}", bool(value >= bar))
-
-
-def told(name, value, unit):
-    return Figure(name, float(value), unit, "", None)
 
 
 # Targets.
@@ -387,7 +367,12 @@ def loops(console):
     return figures
 
 
-PARTS = {"motion": motion, "loops": loops, "protocol": protocol, "verdicts": verdicts}
+def goals(console):
+    """Several goals at once beside mink."""
+    return several(console, ENVIRONMENT, environment())
+
+
+PARTS = {"motion": motion, "loops": loops, "goals": goals, "protocol": protocol, "verdicts": verdicts}
 
 
 def main():

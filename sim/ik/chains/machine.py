@@ -257,7 +257,7 @@ class Machine:
             self._descend(n, address(q), address(a), iterations, int(first), address(out), address(facts))
         return Ends(out, facts[:, 0], facts[:, 1], facts[:, 2])
 
-    def settle(self, q: Array, a: Array, *, iterations: int = 60) -> Settlings:
+    def settle(self, q: Array, a: Array, *, iterations: int = 150) -> Settlings:
         """The way along the goals to what is wished from each row of q (n, nq), as `numeric.settle` goes."""
         q, n = np.ascontiguousarray(q), len(q)
         out, facts = np.empty((n, self.nq)), np.empty((n, 4))

@@ -90,7 +90,8 @@ def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: 
     machine = quick.machine
     first = worth(problem, q, start, faint)
     far = machine.settle(q, machine.arguments(problem, q0=start, s=faint**2))
-    fine = (far.step < _REST / faint) & (far.worst < 1e-2) & (far.value <= first * (1 + 1e-9) + 1e-12)
+    rest = (far.step < _REST / faint) & (far.worst < 1e-2)
+    fine = rest & (far.value <= first * 1.001 + 1e-6)  # q may meet its goals by their tolerances alone
     x, value = far.q, far.value
     if (far.worst[fine] > 1e-6).any():  # wishes that pull hard leave the goals open by rounding
         x = descend(problem, far.q, iterations=8).q
