@@ -20,7 +20,7 @@ import smooth_models as models
 import smooth_peers as peers
 from mujoco.rollout import rollout
 from pantograph.sim.compile.program import workers
-from pantograph.sim.dynamics import Stepper, compile_model, unsupported
+from pantograph.sim.dynamics import compile_model, unsupported
 from pantograph.sim.integrate import TABLEAUS
 from rich.console import Console
 from rich.progress import track
@@ -341,27 +341,22 @@ def _mujoco_costs(model, q, v, exact):
 
 
 def _our_costs(smooth, q, v, times, exact):
-    """Costs of fixed steps by a prepared stepper (as MuJoCo's data is prepared), and of adaptive ones."""
+    """Costs of fixed steps and of adaptive ones, as a user calls them."""
     out = []
-    x, u = np.concatenate([q, v]), np.zeros(smooth.layout.nu)
     for name, method in TABLEAUS.items():
-        steps = STEPS[STEPS < 1e5] if method.order > 2 else []
-        stepper = Stepper(smooth, method, int(max(steps, default=1)))
-        for n in steps:
+        for n in STEPS[STEPS < 1e5] if method.order > 2 else ():
 
-            def fixed(stepper=stepper, n=int(n)):
-                return stepper(x, u, n, SPAN / n)[:: n // FRAMES].copy()
+            def fixed(method=method, n=int(n)):
+                return smooth.rollout(q, v, step=SPAN / n, steps=n, every=n // FRAMES, method=method)
 
-            error = np.abs(fixed()[:, : len(q)] - exact).max()
-            out.append((f"{name} {n} steps", error, _cpu(fixed)))
+            out.append((f"{name} {n} steps", np.abs(fixed().q - exact).max(), _cpu(fixed)))
         for exponent in np.arange(-13, -3, 0.5) if method.adaptive and method.order > 3 else ():
 
             def adaptive(method=method, tolerance=10.0**exponent):
                 return smooth.integrate(q, v, times, method=method, rtol=tolerance, atol=tolerance)
 
-            out.append(
-                (f"{name} to {10.0**exponent:.0e}", np.abs(adaptive().q - exact).max(), _cpu(adaptive))
-            )
+            label = f"{name} to {10.0**exponent:.0e}"
+            out.append((label, np.abs(adaptive().q - exact).max(), _cpu(adaptive)))
     return out
 
 
