@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from .values import Finite, NotNegative, Positive, Switch, at, plain
+from .schema.item import Item
+from .values import Finite, NotNegative, Positive, Switch, at
 
 Limit = Positive | dict[str, Positive] | None
 
 
-class _Item(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _plain(cls, value: Any) -> Any:
-        return plain(value)
-
-
-class PhaseItem(_Item):
+class PhaseItem(Item):
     """A contact: sites that rest on level ground for a while."""
 
     sites: list[str] = Field(min_length=1, description="sites that touch")
@@ -36,7 +28,7 @@ class PhaseItem(_Item):
         return self
 
 
-class FitItem(_Item):
+class FitItem(Item):
     """Limits in rad, m, s, N, A, one number or one a joint by name; the model's own stand where none is."""
 
     how: Literal["check", "retime", "nearest", "fit"] = Field(
