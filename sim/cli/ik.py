@@ -50,7 +50,7 @@ def ik(
     )  # fmt: skip
     _show(loaded, solution, start)
     if film is not None:
-        console.print(f"film: {_film(loaded, start, solution.q, film)}")
+        console.print(f"film: {_film(loaded, goals[1:], start, solution.q, film)}")
     if not solution.solved:
         raise typer.Exit(1)
 
@@ -156,12 +156,12 @@ def _rows(model: Any, answers: Any, start: Any) -> list[tuple[str, list[str], st
     return out
 
 
-def _film(model: Any, start: Any, q: Any, path: Path) -> Path:
+def _film(model: Any, held: list[Goal], start: Any, q: Any, path: Path) -> Path:
     """The way from the start to the answer in two seconds, or a picture of the answer."""
     import numpy as np
 
     from ..film import film, still
-    from ..ik import blend
+    from ..ik import Posture, blend, follow
 
     if path.suffix.lower() == ".png":
         return still(model, q, path)
@@ -169,4 +169,7 @@ def _film(model: Any, start: Any, q: Any, path: Path) -> Path:
     x = np.clip((t - 0.3) / 1.2, 0.0, 1.0)
     share = x * x * (3 - 2 * x)
     way = blend(model, np.tile(start, (len(t), 1)), np.tile(q, (len(t), 1)), share)
+    if held:
+        near = dict(zip(t.tolist(), way, strict=True))
+        way = follow(model, lambda x: [*held, Posture(near[x], weight=1.0)], t, start=way[0]).q
     return film(model, t, way, path)

@@ -38,6 +38,7 @@ _TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference 
 _REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
 _STARTS = 6
 _ROUNDING = 1e-9  # of a limit
+_WALL = 100.0  # weight of the limit of a ball joint beside that of goals
 _TIGHTER = 4  # times that limits are drawn in until rotations keep them
 
 
@@ -101,7 +102,7 @@ def follow(
     acceleration: ArrayLike | None = None,
     start: ArrayLike | None = None,
     around: ArrayLike | None = None,
-    iterations: int = 15,
+    iterations: int = 30,
 ) -> Motion:
     """Motion of `model` along goals(t) at evenly spaced `times` (k,), smooth over the whole clip.
 
@@ -177,6 +178,20 @@ class _Line:
         return out
 
 
+def _walled(space: Space, q: Array, rows: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """`rows` with one more where goals push a ball joint out of its limit: it may only move along that."""
+    out = []
+    for x, (r, J) in zip(q, rows, strict=True):
+        walls = []
+        for ball, axis in space.free_directions(x[None], (J.T @ r)[None])[1]:
+            if axis[0].any():
+                wall = np.zeros((1, J.shape[1]))
+                wall[0, ball.v : ball.v + 3] = _WALL / _TRACKING * axis[0]
+                walls.append(wall)
+        out.append((np.concatenate([r, np.zeros(len(walls))]), np.concatenate([J, *walls])))
+    return out
+
+
 def _first_guess(
     line: _Line, q0: ArrayLike | None, start: ArrayLike | None, v_max: Array, a_max: Array
 ) -> Array:
@@ -219,7 +234,8 @@ def _smoothed(line: _Line, q: Array, limits: Limits, iterations: int) -> Array:
     rows = line.rows(q)
     cost = limits.cost(q, rows)
     for _ in range(iterations):
-        step = smoothest_step(line.space, q, rows, limits, line.moved, reach)
+        walled = _walled(line.space, q, rows)
+        step = smoothest_step(line.space, q, walled, limits, line.moved, reach)
         trial = line.space.step(q, step)
         rows_trial = line.rows(trial)
         lower = limits.cost(trial, rows_trial)
