@@ -130,8 +130,75 @@ def _failures(result: Any, most: int = 8) -> list[str]:
 def _columns(*heads: str) -> Table:
     table = Table()
     for head in heads:
-        if head == "law":
+        if head in ("law", "joint"):
             table.add_column(head, overflow="fold")
         else:
             table.add_column(head, justify="right", no_wrap=True)
+    return table
+
+
+def gains(
+    scene: SceneFile,
+    law: Annotated[str, typer.Option(help="Law; default: the scene's.")] = "",
+    at: Annotated[float, typer.Option(help="Time of the keys to look at [s].")] = 0.0,
+    joint: Annotated[str, typer.Option(help="Joint to draw; default: the one of least margin.")] = "",
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
+) -> None:
+    """Poles, margins and step response of a scene under its law, linearised about its keys."""
+    from ..sim.plan import make_plan
+    from ..sim.scene.load import load_scene
+    from . import design
+    from .design import figures
+    from .design.law import loop_of
+
+    loaded = load_scene(scene)
+    own = loaded.controller
+    law = law or (own.law if own else "pd")
+    words = own.parameters if own and own.law == law else {}
+    system, K = loop_of(make_plan(loaded), law, words, t=at)
+    if joint and joint not in system.inputs:
+        raise PantographError(f"no tracked joint {joint!r}; there is: {', '.join(system.inputs)}")
+    console.print(design.controllability(system).says, soft_wrap=True)
+    found = [design.margins(system, K, input=i) for i in range(len(system.inputs))]
+    console.print(_margins(system, found), _poles(design.closed_loop(system, K)), sep="\n")
+    least = min(range(len(found)), key=lambda i: found[i].disk)
+    chosen = system.inputs.index(joint) if joint else least
+    state = system.states.index(system.inputs[chosen])
+    pictures = {
+        "bode": figures.bode(system, K, input=chosen),
+        "locus": figures.locus(system, K),
+        "step": figures.step(system, K, state, input=chosen),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    for name, picture in pictures.items():
+        path = out / f"{scene.stem}.{name}.png"
+        picture.savefig(path, dpi=120)
+        console.print(f"picture: {path}", soft_wrap=True)
+
+
+def _margins(system: Any, found: list[Any]) -> Table:
+    table = _columns("joint", "phase deg", "delay ms", "least gain", "most gain", "disk")
+    table.title = f"margins of each loop, the others closed, sampled every {system.period * 1e3:g} ms"
+    for name, m in zip(system.inputs, found, strict=True):
+        low, up = m.gain
+        table.add_row(
+            name,
+            f"{math.degrees(m.phase):.1f}",
+            f"{m.delay * 1e3:.3g}",
+            f"{low:.2g}",
+            f"{up:.3g}",
+            f"{m.disk:.2f}",
+        )
+    return table
+
+
+def _poles(loop: Any) -> Table:
+    """Closed-loop modes, a pair of poles a row."""
+    from .design import modes
+
+    table = _columns("frequency rad/s", "damping", "stable")
+    table.title = "closed-loop poles"
+    for mode in modes(loop.A, period=loop.period):
+        if mode.pole.imag >= 0.0:
+            table.add_row(f"{mode.frequency:.4g}", f"{mode.damping:.3f}", "yes" if mode.stable else "NO")
     return table

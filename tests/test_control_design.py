@@ -26,9 +26,12 @@ from pantograph.controllers.design import (
     step_info,
     step_response,
 )
+from pantograph.controllers.design.law import loop_of
 from pantograph.controllers.design.linear import exponential
+from pantograph.controllers.lqr import LQR
 from pantograph.controllers.nominal import Nominal, moved
 from pantograph.models import load_model
+from pantograph.sim import Scene, make_plan, run
 from pantograph.sim.errors import PantographError
 from scipy import linalg
 from strategies import random_states, seeds, trees
@@ -346,6 +349,12 @@ def test_loop_gain_and_root_locus_by_definition():
 def test_pictures_show_what_was_computed():
     A, B, _, _, K = control_gains.inverted_pendulum()
     s = system(A, B)
+    for shown, gains in ((s, [K]), (system(*control_gains.ctms_cart_pendulum()[:2]), None)):
+        gains = gains or [control_gains.ctms_cart_pendulum()[4]]
+        w, phase = figures.bode(shown, gains).axes[1].lines[0].get_data()
+        found = margins(shown, gains)
+        at_crossover = np.interp(found.crossover, w, phase)
+        assert at_crossover == pytest.approx(-180 + np.degrees(found.phase), abs=0.5)
     chart = figures.bode(s, [K])
     w, gain = chart.axes[0].lines[0].get_data()
     np.testing.assert_allclose(10 ** (gain / 20), np.abs(loop_response(s, [K], w)))
@@ -355,3 +364,66 @@ def test_pictures_show_what_was_computed():
     np.testing.assert_allclose(np.sort(dots[0]), np.sort(linalg.eigvals(closed_loop(s, [K]).A).real))
     chart = figures.step(s, [K], 0)
     assert chart.axes[0].lines[0].get_ydata()[-1] == pytest.approx(1 / (K[0] - control_gains.G), rel=1e-2)
+
+
+def balancing(law, duration=1.0, **words):
+    return Scene(
+        duration=duration,
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        keys=[{"joint": "slide", "times": [0], "values": [0]}],
+        initial={"position": {"hinge": 1e-3}},
+        controller={"law": law, "period": 0.01, **words},
+    )
+
+
+def test_the_loop_of_a_law_is_the_one_it_was_designed_for():
+    words = {"goal": {"hinge": 0.0}}
+    plan = make_plan(balancing("lqr", **words))
+    found, K = loop_of(plan, "lqr", words)
+    p = plan.problem
+    tracked = np.array([True, False])
+    law = LQR(p.model, tracked, p.state0.q, p.clip, 0.01, 1.0, ~(tracked | True), **words)
+    np.testing.assert_allclose(K, law.solution.K[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.A, law.solution.A[0], atol=1e-12)
+    np.testing.assert_allclose(found.B, law.solution.B[0], atol=1e-12)
+    assert found.inputs == ("slide",)
+
+
+def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
+    """PD on two of an arm's joints, the others keyed: kd as it is, kp less what the weight gives."""
+    keys = [
+        {"joint": j, "times": [0, 1], "values": [0.2, 0.9], "curve": "clamped"} for j in ("waist", "elbow")
+    ]
+    scene = Scene(
+        duration=1.0,
+        models=[{"file": "arm6"}],
+        roles={"tracked": ["elbow", "shoulder"]},
+        actuators={"*": "off"},
+        keys=[*keys, {"joint": "shoulder", "times": [0], "values": [0.3]}],
+        physics={"friction": False, "contacts": "none"},
+        controller={"law": "pd", "period": 0.002},
+    )
+    words = {"kp": {"shoulder": 300.0, "elbow": 200.0}, "kd": {"shoulder": 30.0, "elbow": 20.0}}
+    plan = make_plan(scene)
+    found, K = loop_of(plan, "pd", words, t=0.4)
+    assert found.states[:2] == ("shoulder", "elbow")
+    free = [i for i, s in enumerate(found.states[: len(found.states) // 2])]
+    n = len(free)
+    np.testing.assert_allclose(K[:2, n : n + 2], np.diag([30.0, 20.0]), atol=1e-5)
+    q, nominal = plan.problem.clip.evaluate(0.4).q, Nominal(plan.problem.model)
+    for i, dof in enumerate((1, 2)):
+        unit = 1e-5 * np.eye(6)[dof]
+        slope = (nominal.weight(q + unit) - nominal.weight(q - unit))[[1, 2]] / 2e-5
+        expected = np.diag([300.0, 200.0])[:, i] - slope
+        np.testing.assert_allclose(K[:, i], expected, rtol=1e-5, atol=1e-4)
+
+
+def test_the_delay_that_a_loop_stands_is_the_one_that_a_scene_stands():
+    words = {"goal": {"hinge": 0.0}, "position": 10.0}
+    found, K = loop_of(make_plan(balancing("lqr", **words)), "lqr", words)
+    ticks = int(margins(found, K).delay / 0.01)
+    assert 1 <= ticks <= 20
+    stood, lost = (run(balancing("lqr", duration=8.0, delay=0.01 * d, **words)) for d in (ticks, ticks + 2))
+    assert np.abs(stood.q[-1]).max() < 1e-3
+    assert np.abs(lost.q).max() > 0.1

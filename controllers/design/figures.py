@@ -16,18 +16,23 @@ if TYPE_CHECKING:
 
 
 def bode(system: LinearSystem, K: ArrayLike, *, input: int = 0) -> Figure:
-    """Loop gain [dB] and phase [deg] over frequency [rad/s], cut at one ``input``, margins marked."""
+    """Loop gain [dB] and phase [deg] over frequency [rad/s], cut at one ``input``, its margins marked."""
     from matplotlib.figure import Figure
 
     found = margins(system, K, input=input)
     middle = found.crossover if np.isfinite(found.crossover) else 1.0
-    high = 1e3 * middle if system.period is None else np.pi / system.period
+    high = 1e2 * middle if system.period is None else np.pi / system.period
     w = np.geomspace(1e-3 * middle, high, 800)
     L = loop_response(system, K, w, input=input)
     chart = Figure(figsize=(8, 6), layout="constrained")
     top, bottom = chart.subplots(2, 1, sharex=True)
     top.semilogx(w, 20.0 * np.log10(np.abs(L)))
-    bottom.semilogx(w, np.degrees(np.unwrap(np.angle(L))))
+    phase = np.degrees(np.unwrap(np.angle(L)))
+    if np.isfinite(found.phase):  # of the turns that an angle leaves open, those that show the margin
+        phase -= 360.0 * np.round((np.interp(middle, w, phase) + 180.0 - np.degrees(found.phase)) / 360.0)
+        bottom.vlines(found.crossover, -180.0, -180.0 + np.degrees(found.phase), color="C1", lw=3)
+    bottom.semilogx(w, phase)
+    bottom.axhline(-180.0, color="grey", lw=0.8)
     for ax in (top, bottom):
         ax.axvline(found.crossover, color="grey", ls=":")
         ax.grid(alpha=0.3, which="both")

@@ -32,7 +32,7 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'p
 
 def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
-    from ...controllers.cli import control
+    from ...controllers.cli import control, gains
     from ...controllers.fit.command import fit
     from ...hardware.cli import app as servo
     from .ik import ik
@@ -40,6 +40,7 @@ def run_app() -> None:
     app.add_typer(servo)
     app.command(epilog="Example: pantograph ik arm6 --site tip --to 0.4,0.1,0.5 --film reach.mp4")(ik)
     app.command(epilog="Example: pantograph control wave.toml --compare pd,computed-torque")(control)
+    app.command(epilog="Example: pantograph gains wave.toml --law lqr")(gains)
     app.command(epilog="Example: pantograph fit wave.toml")(fit)
     try:
         app()
