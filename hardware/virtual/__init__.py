@@ -2,10 +2,11 @@
 
 from .bus import Ledger, Timing, VirtualBus
 from .faults import NO_FAULTS, CablePull, FaultPlan, ServoFault, WireFault
+from .firmware import Quirks
 from .motor import MOTORS, Gear, Motor, Plant, joints
 from .port import MemoryPort
 from .pty import PtyServer, serve
-from .servo import Quirks, VirtualServo
+from .servo import VirtualServo
 
 __all__ = [
     "MOTORS",

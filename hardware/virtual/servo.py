@@ -1,55 +1,24 @@
-"""A virtual servo: control table, instructions and protection around a drive.
-
-Behaviour follows the e-manual pages of the X series; where they are silent or the notes of users disagree,
-the choice is an argument of `Quirks` and set to the harsher case.
-"""
+"""A virtual servo: what a bus and the world see of it, around its firmware and drive."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf
 
 from ..errors import HardwareError
 from ..packets import ALERT, BROADCAST, MAX_ID, Packet, StatusError
-from ..registers import FIRST_RAM_ADDRESS, ControlTable, Register, control_table
-from ..tables.rows import POSITION, VELOCITY
-from . import drive as d
-from .drive import PERIOD, Drive, within_one_turn
+from ..registers import FIRST_RAM_ADDRESS, control_table
+from ..tables.rows import VELOCITY
+from .drive import PERIOD, Drive
+from .firmware import Firmware, Quirks
 from .instructions import execute
-from .mapping import counts, report, settings
-from .memory import Memory
+from .mapping import counts, report
 from .motor import MOTORS, Gear, Motor, Plant
 
 VOLTAGE, OVERHEATING, ENCODER, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0x20
-GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
-GOALS_OF_MODE = {0: GOALS[1], 1: GOALS[2], 3: GOALS[3], 4: GOALS[3], 5: GOALS[3], 16: GOALS[0]}
 SLOW = 10  # control periods between updates of voltage, temperature and protection
 
 
-@dataclass(frozen=True)
-class Quirks:
-    """What the manual leaves open.
-
-    Args:
-        goal_survives_torque_off: At torque-on the servo goes to the old goal (True, the dangerous case) or
-            holds.
-        effort_goals_open: After power-on and a change of mode Goal PWM and Goal Current stand at their
-            limits in every mode, as the manual says: torque-on in PWM or current mode then runs at full
-            power. False: zero in the mode that they drive.
-        goal_limit_error: Answer to a goal position outside of the position limits.
-        boot_time: Silence after a reboot [s].
-        overload_ratio, overload_time: Overload is this part of the stall current for this long [s].
-    """
-
-    goal_survives_torque_off: bool = True
-    effort_goals_open: bool = True
-    goal_limit_error: StatusError = StatusError.DATA_LIMIT
-    boot_time: float = 0.1
-    overload_ratio: float = 0.8
-    overload_time: float = 1.0
-
-
-class VirtualServo:
+class VirtualServo(Firmware):
     """One servo on a virtual bus.
 
     Kept but without effect: feedforward gains, PWM slope, acceleration limit, external ports, LED, a
@@ -65,7 +34,7 @@ class VirtualServo:
         firmware: Version; the first that answers fast reads when None.
         supply: Voltage [V]; the recommended one when None.
         ambient: Temperature [degC].
-        quirks: What the manual leaves open.
+        quirks: What the manual leaves open; the harsher cases when None.
         registers: Values in counts, by name, in place of the factory's; those of RAM last until a reboot.
 
     Raises:
@@ -85,25 +54,20 @@ class VirtualServo:
         firmware: int | None = None,
         supply: float | None = None,
         ambient: float = 25.0,
-        quirks: Quirks = Quirks(),
+        quirks: Quirks | None = None,
         registers: dict[str, int] | None = None,
     ) -> None:
-        self.table: ControlTable = control_table(model)
-        self.quirks = quirks
-        motor = motor or MOTORS[self.table.model]
+        table = control_table(model)
+        motor = motor or MOTORS[table.model]
         plant = plant or Gear(motor.inertia, motor.coulomb, position=position)
-        self.drive = Drive(motor, plant, supply=motor.voltage if supply is None else supply, ambient=ambient)
-        self.memory = Memory(self.table)
-        self.time = 0.0
+        supply = motor.voltage if supply is None else supply
+        super().__init__(table, Drive(motor, plant, supply=supply, ambient=ambient), quirks or Quirks())
         self.dead = False
-        self._latched = 0  # hardware error bits
         self._overload = 0.0
         self._periods = 0
         self._boot_until = -inf
-        self._fed = 0.0
         self._registered: tuple[int, bytes, bool] | None = None
         self._backup: bytes | None = None
-        self._fresh = -1.0
         self.firmware = firmware or self.table.fast_read_firmware or 45
         self._factory()
         self.memory.put("id", id)
@@ -187,29 +151,6 @@ class VirtualServo:
         if watchdog and self.drive.settings.torque and self.time - self._fed > watchdog:
             self.trip_watchdog()
 
-    def feed(self) -> None:
-        """The servo heard an instruction packet: its bus watchdog starts again."""
-        self._fed = self.time
-
-    def trip_watchdog(self) -> None:
-        """Stop as the bus watchdog does: motion off, profiles 0, goals locked."""
-        self.memory.put("bus_watchdog", -1)
-        self.memory.put("profile_velocity", 0)
-        self.memory.put("profile_acceleration", 0)
-        goal = GOALS_OF_MODE[self.memory.get("operating_mode")]
-        if goal != "goal_position":
-            self.memory.put(goal, 0)
-        self._apply_settings()
-        self.drive.halt()
-
-    def fail(self, bit: int) -> None:
-        """Latch a hardware error; one that the shutdown register selects takes the torque away."""
-        self._latched |= bit
-        self.memory.put("hardware_error_status", self._latched)
-        if self._latched & self.memory.get("shutdown"):
-            self.memory.put("torque_enable", 0)
-            self._apply_settings()
-
     def _protect(self, dt: float) -> None:
         drive, memory = self.drive, self.memory
         if drive.temperature > memory.get("temperature_limit"):
@@ -257,57 +198,10 @@ class VirtualServo:
             self._torque(True)
         self._fresh = -1.0
 
-    def _default_goals(self) -> None:
-        """Goals after power-on or a change of mode: the position is the present one, limits are open."""
-        memory, mode = self.memory, self.memory.get("operating_mode")
-        shut = not self.quirks.effort_goals_open
-        memory.put("goal_pwm", 0 if shut and mode == d.PWM_MODE else memory.get("pwm_limit"))
-        if self.table.has_current:
-            memory.put("goal_current", 0 if shut and mode == d.CURRENT_MODE else memory.get("current_limit"))
-        memory.put("goal_velocity", 0)
-        memory.put("goal_position", counts(self.drive.position))
-        self._apply_settings()
-        self.drive.hold()
-
     def reboot(self) -> None:
         """Restart: RAM is as after power-on, errors are forgotten, nothing is heard for the boot time."""
         self._power_on()
         self._boot_until = self.time + self.quirks.boot_time
-
-    def _reset_turns(self) -> None:
-        """Report the shaft within one turn, homing offset added."""
-        offset = self.memory.get("homing_offset")
-        if self.memory.get("operating_mode") == d.POSITION_MODE and abs(offset) > 1024:
-            offset = 0
-        sign = -1.0 if self.drive.settings.reverse else 1.0
-        self.drive.place(within_one_turn(sign * self.drive.shaft) + offset * POSITION)
-        self._offset = offset
-
-    # From registers to the drive.
-
-    def _apply_settings(self) -> None:
-        """Let the drive follow the registers; called after every change of one."""
-        watchdog = self.memory.get("bus_watchdog")
-        self._watchdog_period = watchdog * 0.02 if watchdog > 0 else 0.0
-        self._fresh = -1.0
-        self.drive.settings = settings(self.memory, reverse=self.drive.settings.reverse)
-
-    def _torque(self, on: bool) -> None:
-        if on and self._latched & self.memory.get("shutdown"):
-            return  # only a reboot recovers
-        was = self.drive.settings.torque
-        self.memory.put("torque_enable", int(on))
-        if on and not was:
-            if self.memory.get("operating_mode") == d.POSITION_MODE:
-                self._reset_turns()
-            self._fed = self.time
-            self.drive.hold()
-            if not self.quirks.goal_survives_torque_off:
-                self.memory.put("goal_position", counts(self.drive.position))
-            self._apply_settings()
-            if not self.drive.halted:
-                self.drive.plan()
-        self._apply_settings()
 
     # What instructions do.
 
@@ -351,85 +245,6 @@ class VirtualServo:
         for row, raw in values.items():
             self._set(row, raw)
         return StatusError.NONE
-
-    def _refusal(self, row: Register, raw: int, shadow: bool) -> StatusError:
-        if row.area == "EEPROM" and (self.drive.settings.torque or shadow):
-            return StatusError.ACCESS
-        if row.name in GOALS and self.memory.get("bus_watchdog") == -1:
-            return StatusError.DATA_RANGE
-        if row.name == "bus_watchdog" and raw and self.memory.get(row.name) == -1:
-            return StatusError.DATA_RANGE  # only 0 clears it
-        if row.name == "operating_mode" and raw not in self.table.modes:
-            return StatusError.DATA_RANGE
-        if row.name == "goal_position":
-            mode = self.memory.get("operating_mode")
-            if mode == d.POSITION_MODE:
-                low, high = self.memory.get("min_position_limit"), self.memory.get("max_position_limit")
-                return StatusError.NONE if low <= raw <= high else self.quirks.goal_limit_error
-            if abs(raw) > 1_048_575:
-                return StatusError.DATA_RANGE
-        return self.memory.check(row, raw)
-
-    def _set(self, row: Register, raw: int) -> None:
-        """Store a value and do what follows from it."""
-        name = row.name
-        if name == "torque_enable":
-            self._torque(bool(raw))
-            return
-        tripped = name == "bus_watchdog" and self.memory.get(name) == -1
-        self.memory.put(name, raw)
-        if name == "bus_watchdog":
-            self._fed = self.time
-            self._apply_settings()
-            if tripped and raw == 0:
-                self._resume()
-        elif name == "operating_mode":
-            self._change_mode()
-        elif name in ("homing_offset", "drive_mode"):
-            self._change_frame()
-        elif name in GOALS:
-            self._new_goal(name)
-        else:
-            self._apply_settings()
-
-    def _resume(self) -> None:
-        self.memory.put("goal_position", counts(self.drive.position))
-        self._apply_settings()
-        self.drive.resume()
-
-    def _change_mode(self) -> None:
-        """Profiles and gains fall back to their defaults (manual: Operating Mode)."""
-        for row in self.table.registers:
-            if row.name.endswith("_gain") or row.name.startswith("profile_"):
-                self.memory.put(row.name, row.default or 0)
-        self._apply_settings()
-        if self.memory.get("operating_mode") == d.POSITION_MODE:
-            self._reset_turns()
-        self._default_goals()
-
-    def _change_frame(self) -> None:
-        """Homing offset or reverse mode: the same shaft angle reads differently, turns are kept."""
-        drive = self.drive
-        actual = drive.position - self._offset * POSITION
-        offset = self.memory.get("homing_offset")
-        if self.memory.get("operating_mode") == d.POSITION_MODE and abs(offset) > 1024:
-            offset = 0
-        reverse = bool(self.memory.get("drive_mode") & 1)
-        if reverse != drive.settings.reverse:
-            drive.settings.reverse = reverse
-            actual = -actual
-        drive.place(actual + offset * POSITION)
-        self._offset = offset
-        self._apply_settings()
-        drive.hold()
-
-    def _new_goal(self, name: str) -> None:
-        active = GOALS_OF_MODE[self.memory.get("operating_mode")]
-        if name == active and self.memory.get("drive_mode") & 8 and not self.drive.settings.torque:
-            self._torque(True)
-        self._apply_settings()
-        if name == active and self.drive.settings.torque:
-            self.drive.plan()
 
     def register(self, address: int, data: bytes, *, shadow: bool = False) -> StatusError:
         """Keep a write until the action comes."""
