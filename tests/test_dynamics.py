@@ -744,6 +744,12 @@ def test_a_motion_that_cannot_go_on_says_so():
     assert not path.success
     few = smooth.integrate([0.3, 0.1], [0.0, 0.0], [0.0, 5.0], rtol=1e-10, atol=1e-10, max_steps=10)
     assert few.status == 1
+    for bad in (np.nan, np.inf):
+        path = smooth.integrate([[0.3, bad], [0.3, 0.1]], [0.0, 0.0], [0.0, 0.1, 0.2])
+        assert path.status.tolist() == [3, 0]
+        assert np.isfinite(path.x[1]).all()
+        alone = smooth.integrate([0.3, 0.1], [0.0, bad], [0.0, 0.1])
+        assert alone.status == 3 and not alone.success
     assert np.isnan(few.x[-1]).all()
 
 

@@ -51,9 +51,10 @@ def exp2(e: Emitter, y: str) -> str:
 class _Integrator:
     """Writes the body of one adaptive integration."""
 
-    def __init__(self, method: Any, shape: Shape, lanes: int, guards: int, pulling: range):
+    def __init__(self, method: Any, shape: Shape, lanes: int, guards: int, rateless: int, pulling: range):
         self.e = e = Emitter(lanes)
         self.method, self.shape, self.guards, self.pulling = method, shape, guards, pulling
+        self.rateless = range(guards - rateless, guards)
         self.stages, self.extra = len(method.b), len(method.dense.c)
         nx = shape.nx
         self.X, self.Y, self.XN = e.slot(nx), e.slot(nx), e.slot(nx)
@@ -110,23 +111,29 @@ class _Integrator:
             f"ptr %offsets, ptr {values}, ptr {rates})"
         )
 
-    def halfway(self, h: str) -> None:
-        """State and prescribed motion in the middle of a step, by the cubic through both ends."""
-        e, half = self.e, self.e.const(0.5)
-        for i in e.over(self.shape.nx):
-            mean = e.f("fmul", e.f("fadd", e.load(self.X, i), e.load(self.XN, i)), half)
-            bend = e.f("fsub", e.load(self.K[0], i), e.load(self.K[self.last], i))
-            e.store(e.f("fadd", mean, e.f("fmul", e.f("fmul", h, e.const(0.125)), bend)), self.Y, i)
-        self.prescribe(e.f("fadd", self.get("t"), e.f("fmul", h, half)))
+    def differences(self, h: str) -> None:
+        """Rates at both ends of a step of the guards that come without, by differences along the slopes."""
+        e, beside, unused = self.e, self.e.slot(self.guards), self.e.slot(self.guards)
+        ends = (
+            (self.X, self.K[0], self.get("t"), 1e-4, self.G, self.G_rate),
+            (self.XN, self.K[self.last], self.get("t_new"), -1e-4, self.GN, self.GN_rate),
+        )
+        for x, slope, t, share, values, rates in ends:
+            d = e.f("fmul", h, e.const(share))
+            combine(e, self.Y, x, d, [(1.0, slope)], self.shape.nx)
+            self.prescribe(e.f("fadd", t, d))
+            self.guard(self.Y, beside, unused)
+            for i in self.rateless:
+                change = e.f("fsub", e.load(beside, i), e.load(values, i))
+                e.store(e.f("fdiv", change, d), rates, i)
 
     def hold_back(self, h: str, accept: str) -> str:
-        """The lanes that accept without those where a guard is below zero at the step's end or middle, or may
-        have been elsewhere: it fell at the start and rises at the end, near enough to zero."""
+        """The lanes that accept without those where a guard is below zero at the step's end, or may have
+        been in between: it fell at the start and rises at the end, near enough to zero."""
         e = self.e
         self.guard(self.XN, self.GN, self.GN_rate)
-        middle, rates = e.slot(self.guards), e.slot(self.guards)
-        self.halfway(h)
-        self.guard(self.Y, middle, rates)
+        if self.rateless:
+            self.differences(h)
         stop = e.compare("one", e.const(0.0), e.const(0.0))
         for i in range(self.guards):
             before, after = e.load(self.G, i), e.load(self.GN, i)
@@ -137,8 +144,7 @@ class _Integrator:
             )
             near = e.compare("olt", lower, e.f("fmul", h, e.f("fsub", rise, fall)))
             dipped = e.emit(f"and {e.B} {turned}, {near}")
-            below = [e.compare("olt", value, e.const(0.0)) for value in (after, e.load(middle, i))]
-            for suspect in (*below, dipped):
+            for suspect in (e.compare("olt", after, e.const(0.0)), dipped):
                 stop = e.emit(f"or {e.B} {stop}, {suspect}")
         stop = e.emit(f"and {e.B} {stop}, {accept}")
         self.set("status", e.select(stop, e.const(GUARDED), self.get("status")))
@@ -419,7 +425,14 @@ class _Integrator:
 
 
 def adaptive_steps(
-    name: str, method: Any, shape: Shape, lanes: int, *, guards: int = 0, pulling: range = range(0)
+    name: str,
+    method: Any,
+    shape: Shape,
+    lanes: int,
+    *,
+    guards: int = 0,
+    rateless: int = 0,
+    pulling: range = range(0),
 ) -> str:
     """Integration to a tolerance, as IR.
 
@@ -430,9 +443,10 @@ def adaptive_steps(
     prescribed velocities, whose accelerations are the entries `pulling` of w. `path` receives the states at
     t_eval from index `first_eval` on, `x1` the final states, `stats` the STATISTICS of every state. With
     `guards`, the kernel `guard` (q, v, act, u, w, p, offsets) -> values and rates: a state stops before the
-    step that may take a value below zero, with status GUARDED and that step's length as the next one's.
+    step that may take a value below zero, with status GUARDED and that step's length as the next one's; the
+    last `rateless` guards come without rates.
     """
-    writer = _Integrator(method, shape, lanes, guards, pulling)
+    writer = _Integrator(method, shape, lanes, guards, rateless, pulling)
     writer.batch()
     arguments = ["i64 %n", "i64 %periods", "i64 %spans", "ptr noalias %edges", "ptr noalias %of_span"]
     arguments += ["double %t0", "double %rtol"]

@@ -40,11 +40,13 @@ class Guards:
     Attributes:
         key: what the functions are, for the compiled code's key.
         count: how many.
+        rateless: how many of them, the last ones, have no rate.
         tape: makes the program (q, v, act, u, w, p, offsets) -> values and their rates.
     """
 
     key: str
     count: int
+    rateless: int
     tape: Callable[[], Tape]
 
 
@@ -112,7 +114,7 @@ def compiled_loop(
             parts["law"] = law.tape(smooth.layout)
         if guards is not None:
             parts["guard"] = guards.tape()
-            options["guards"] = guards.count
+            options.update(guards=guards.count, rateless=guards.rateless)
         kernels = loops = declarations(lanes) + "\n"
         for part, tape in parts.items():
             kernels += kernel(part, tape, lanes)

@@ -137,7 +137,7 @@ class Compiled:
         from ..dynamics.functions import drive_forces
 
         sides = [(limit.joint, limit.bound, limit.side) for limit in (*free, *self.resting)]
-        return Guards(repr((sides, len(self.resting))), count, tape)
+        return Guards(repr((sides, len(self.resting))), count, len(self.resting), tape)
 
     def guard_offsets(self, held: Held, limits: Limits) -> Array:
         """What is added to the guards under held inputs: a controller's forces on joints at rest."""

@@ -116,16 +116,16 @@ class Run:
 
     def first_event(self, length: float) -> Moment | None:
         """What happens first within one step of ``length`` seconds from here."""
-        q, v, act = self.roll(length)
+        q, v, _ = self.roll(length)
         found: list[Moment] = []
         for limit in self.limits.near(self.q, self.v, q, v, length, self.resting):
             share = self._meeting(limit, q, v, length)
             if share is not None:
                 found.append(Moment(share, limit, True))
-        for share in (0.5, 1.0) if self.resting else ():
-            state = (q, v, act) if share == 1.0 else self.roll(share * length)
-            for i in np.flatnonzero(self.limit_forces(self.offset + share * length, *state) < 0):
-                found.append(Moment(self._leaving(int(i), share, length), self.resting[i], False))
+        for i, limit in enumerate(self.resting):
+            pulled = self._weakest(i, length)
+            if pulled is not None:
+                found.append(Moment(self._leaving(i, pulled, length), limit, False))
         return min(found, key=lambda moment: moment.share, default=None)
 
     def _meeting(self, limit: Limit, q: Array, v: Array, length: float) -> float | None:
@@ -147,20 +147,34 @@ class Run:
                 return None
         return 0.0 if gap(0.0) <= 0.0 else float(brentq(gap, 0.0, last, xtol=NARROW))
 
+    def _force(self, i: int, share: float, length: float) -> float:
+        """Force of the limit on the joint that rests on it, a share of the step from here."""
+        state = self.roll(share * length) if share > 0.0 else (self.q, self.v, self.act)
+        return float(self.limit_forces(self.offset + share * length, *state)[i])
+
+    def _weakest(self, i: int, length: float) -> float | None:
+        """A share of the step, the first that is found, at which the limit pulls; None if it never does."""
+        from scipy.optimize import minimize_scalar
+
+        shares = np.linspace(0.0, 1.0, 9)
+        forces = np.array([self._force(i, float(share), length) for share in shares])
+        if (forces < 0).any():
+            return float(shares[np.argmax(forces < 0)])
+        least = int(np.argmin(forces))
+        around = shares[max(0, least - 1)], shares[min(8, least + 1)]
+        found = minimize_scalar(lambda share: self._force(i, share, length), bounds=around, method="bounded")
+        return float(found.x) if found.fun < 0 else None
+
     def _leaving(self, i: int, last: float, length: float) -> float:
         """Share of the step at which the limit begins to pull the joint on it, as it does at the ``last``."""
         from scipy.optimize import brentq
 
-        def force(share: float) -> float:
-            state = self.roll(share * length) if share > 0.0 else (self.q, self.v, self.act)
-            return float(self.limit_forces(self.offset + share * length, *state)[i])
-
-        if force(0.0) <= 0.0:
+        if last == 0.0 or self._force(i, 0.0, length) <= 0.0:
             return 0.0
-        root = float(brentq(force, 0.0, last, xtol=NARROW))
+        root = float(brentq(lambda share: self._force(i, share, length), 0.0, last, xtol=NARROW))
         # on the side where it pulls, so that the joint is let go
         after = min(last, root + 4 * NARROW)
-        return after if force(after) < 0.0 else last
+        return after if self._force(i, after, length) < 0.0 else last
 
     def move(self, share: float, length: float) -> None:
         """Go on by a ``share`` of a step."""
