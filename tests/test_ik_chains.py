@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import ik_cases
+from oracles import ik_cases, ik_planar, ik_ur
 from pantograph.models import ModelError, data_robots, load_model
-from pantograph.sim.ik import ChainSolver, Position
+from pantograph.sim import rotations
+from pantograph.sim.ik import ChainSolver, Pose, Position, solve
 from pantograph.sim.ik.chains.axes import Axis, linear_trig, three_turns, trig_roots
+from pantograph.sim.ik.chains.closed_form import closed_form
 from pantograph.sim.ik.chains.solver import moving_part
 from pantograph.sim.ik.chains.step import Chain, step_tape
-from pantograph.sim.ik.numeric.descend import _steps, held_projection
+from pantograph.sim.ik.numeric.descend import _steps, descend, held_projection
 from pantograph.sim.ik.problem import Problem
 from pantograph.sim.ik.space import Space
 from pantograph.sim.kinematics import frame
@@ -257,3 +259,76 @@ def test_a_joint_at_its_limit_is_left_out_of_the_step_only_when_it_is_pushed_out
     assert mask[j] == (not outward)
     direct = _steps(problem, q[None], w, np.array([1e-9]))[0]
     assert (direct[j] == 0) == outward
+
+
+def _same_angles(a, b, atol):
+    """Whether rows of a and of b are the same up to order and whole turns."""
+    apart = np.abs(ik_planar.wrap(a[:, None] - b[None])).max(axis=2)
+    return len(a) == len(b) and (apart.min(axis=0) < atol).all() and (apart.min(axis=1) < atol).all()
+
+
+def _ur5():
+    import sys
+    from pathlib import Path
+
+    sys.path.insert(0, str(Path(__file__).parent / "bench"))
+    from arms import ur5
+
+    return ur5()
+
+
+def test_all_solutions_of_a_ur_arm_are_those_of_its_dh_formulas():
+    model, rng, counts = _ur5(), np.random.default_rng(0), []
+    for _ in range(150):
+        X = frame(model, "site", "tip").pose(rng.uniform(-np.pi, np.pi, 6))
+        quat = rotations.from_matrix(X[:3, :3])
+        problem = Problem(model, [Pose("tip", X[:3, 3], quat)], Space(model))
+        found = closed_form(problem, model.qpos0)
+        assert found.structure == "three parallel axes"
+        assert found.complete
+        truth = ik_ur.angles(X)
+        assert _same_angles(found.q, truth, 1e-6)
+        assert np.abs(problem.raw(found.q).r).max() < 1e-10
+        counts.append(len(truth))
+    assert max(counts) == 8
+    assert min(counts) < 8
+    solution = solve(model, Pose("tip", X[:3, 3], quat), all=True)
+    assert _same_angles(solution.solutions, truth, 1e-6)
+    quat = rotations.from_matrix(np.eye(3))
+    assert len(closed_form(Problem(model, [Pose("tip", [2, 0, 0], quat)], Space(model)), model.qpos0).q) == 0
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_any_arm_with_three_parallel_axes_and_two_that_meet(backwards):
+    """Skew first axis, offsets everywhere; what a search from many starts finds is in the closed form."""
+    rng = np.random.default_rng(int(backwards))
+    for _ in range(4):
+        u, five = ik_cases.unit(rng), ik_cases.unit(rng)
+        axes = [ik_cases.unit(rng), u, u, -u, five, ik_cases.unit(rng)]
+        offsets = [np.zeros(3), *(0.3 * rng.normal(size=(4, 3))), np.zeros(3)]
+        if backwards:
+            axes, offsets = axes[::-1], [np.zeros(3), np.zeros(3), *offsets[1:5]]
+        links = [(o, ik_cases.HINGE, a, (-np.pi, np.pi)) for o, a in zip(offsets, axes, strict=True)]
+        model = ik_cases.chain([*links, (0.3 * rng.normal(size=3), None, None, None)])
+        q = rng.uniform(-3, 3, 6)
+        problem = Problem(model, [Pose("tip", *ik_cases.pose_of(model, q, "tip"))], Space(model))
+        found = closed_form(problem, model.qpos0)
+        assert found is not None and found.structure == "three parallel axes"
+        assert found.complete
+        assert 1 <= len(found.q) <= 8
+        assert np.abs(problem.raw(found.q).r).max() < 1e-8
+        starts = problem.space.random(rng, 60, model.qpos0, problem.moved)
+        ends = descend(problem, starts)
+        for x in [q, *ends.q[ends.met]]:
+            assert np.abs(ik_planar.wrap(found.q - x)).max(axis=1).min() < 1e-4
+
+
+@pytest.mark.parametrize("spoil", ["none", "parallel", "meeting"])
+def test_arms_that_nearly_have_a_structure_are_not_taken_for_it(spoil):
+    model = _ur5()
+    if spoil == "parallel":
+        model.body_quat[3] += [0, 1e-7, 0, 0]
+    if spoil == "meeting":
+        model.body_pos[6] += [1e-6, 0, 0]
+    problem = Problem(model, [Pose("tip", [0.3, 0.2, 0.4], [1, 0, 0, 0])], Space(model))
+    assert (closed_form(problem, model.qpos0) is None) == (spoil != "none")

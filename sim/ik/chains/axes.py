@@ -7,6 +7,7 @@ world; the frame moves by exp(u_1, th_1) ... exp(u_n, th_n) (product of exponent
 
 from __future__ import annotations
 
+from math import acos, atan2, cos, hypot, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -37,11 +38,19 @@ class Axis(NamedTuple):
 
 def turned(u: Array, angle: float, x: Array) -> Array:
     """The vector x turned about the direction u (Rodrigues)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(c * x + s * _cross(u, x) + (1.0 - c) * (u @ x) * u)
+    c, s = cos(angle), sin(angle)
+    (a, b, d), (x0, x1, x2) = u.tolist(), x.tolist()
+    along = (1.0 - c) * (a * x0 + b * x1 + d * x2)
+    return np.array(
+        [
+            c * x0 + s * (b * x2 - d * x1) + along * a,
+            c * x1 + s * (d * x0 - a * x2) + along * b,
+            c * x2 + s * (a * x1 - b * x0) + along * d,
+        ]
+    )
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross(a: Array, b: Array) -> Array:
     """a x b, many times quicker than NumPy's for single vectors."""
     x, y, z = a.tolist()
     u, v, w = b.tolist()
@@ -50,7 +59,16 @@ def _cross(a: Array, b: Array) -> Array:
 
 def turn_matrix(u: Array, angle: float) -> Array:
     """Rotation matrix (3, 3) about the direction u."""
-    return np.column_stack([turned(u, angle, e) for e in np.eye(3)])
+    c, s = cos(angle), sin(angle)
+    x, y, z = u.tolist()
+    v = 1.0 - c
+    return np.array(
+        [
+            [c + v * x * x, v * x * y - s * z, v * x * z + s * y],
+            [v * x * y + s * z, c + v * y * y, v * y * z - s * x],
+            [v * x * z - s * y, v * y * z + s * x, c + v * z * z],
+        ]
+    )
 
 
 def trig_roots(f: list[float] | Array) -> Roots:
@@ -78,21 +96,26 @@ def trig_roots(f: list[float] | Array) -> Roots:
 
 def around(axis: Array, a: Array, b: Array) -> float | None:
     """Angle about `axis` that turns a's direction onto b's, seen along it; None when one is along it."""
-    pa, pb = a - (a @ axis) * axis, b - (b @ axis) * axis
-    if min(float(pa @ pa), float(pb @ pb)) < _FLAT**2 * max(float(a @ a), float(b @ b), 1e-300):
+    (x, y, z), (a0, a1, a2), (b0, b1, b2) = axis.tolist(), a.tolist(), b.tolist()
+    s, t = a0 * x + a1 * y + a2 * z, b0 * x + b1 * y + b2 * z
+    aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+    a0, a1, a2, b0, b1, b2 = a0 - s * x, a1 - s * y, a2 - s * z, b0 - t * x, b1 - t * y, b2 - t * z
+    least = min(a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2)
+    if least < _FLAT**2 * max(aa, bb, 1e-300):
         return None
-    return float(np.arctan2(axis @ _cross(pa, pb), pa @ pb))
+    sine = x * (a1 * b2 - a2 * b1) + y * (a2 * b0 - a0 * b2) + z * (a0 * b1 - a1 * b0)
+    return atan2(sine, a0 * b0 + a1 * b1 + a2 * b2)
 
 
 def linear_trig(a: float, b: float, c: float) -> Roots:
     """Angles with a cos th + b sin th = c; the nearest one, uncertain, when just out of reach."""
-    size = float(np.hypot(a, b))
+    size = hypot(a, b)
     if size < _FLAT * max(1.0, abs(c)):
         return Roots([], abs(c) > 1e-6)
     ratio = c / size
     if abs(ratio) > 1 + _CLEAR:
         return Roots([], True)
-    middle, half = float(np.arctan2(b, a)), float(np.arccos(np.clip(ratio, -1.0, 1.0)))
+    middle, half = atan2(b, a), acos(min(max(ratio, -1.0), 1.0))
     return Roots([middle + half, middle - half], abs(ratio) < 1 - 1e-12)
 
 
@@ -102,7 +125,7 @@ def two_turns(u1: Array, u2: Array, a: Array, b: Array) -> tuple[list[tuple[floa
     a on the second axis leaves th2 open: it is then 0.
     """
     along = a - (a @ u2) * u2
-    side = _cross(u2, a)
+    side = cross(u2, a)
     roots = linear_trig(float(u1 @ along), float(u1 @ side), float(u1 @ b - (a @ u2) * (u1 @ u2)))
     out, complete = [], roots.complete
     for th2 in roots.angles or ([] if roots.complete else [0.0]):
@@ -130,10 +153,10 @@ def point_by_three(axes: list[Axis], w: Array, target: Array) -> ThreeTurns:
     """
     one, two, three = axes
     o, o2, e, a = _feet(one, two)
-    f = _cross(two.u, e)
+    f = cross(two.u, e)
     sine, cosine = float(one.u @ f), float(one.u @ two.u)
     r, h = float((target - o) @ (target - o)), float(one.u @ (target - o))
-    size = max(a, float(np.linalg.norm(w - o2)), np.sqrt(r), 1e-9)
+    size = max(a, float(np.linalg.norm(w - o2)), sqrt(r), 1e-9)
 
     def local(th3: float) -> tuple[float, float, float]:
         p = three.turn(th3, w) - o2
@@ -178,14 +201,14 @@ def point_by_three(axes: list[Axis], w: Array, target: Array) -> ThreeTurns:
 def _feet(one: Axis, two: Axis) -> tuple[Array, Array, Array, float]:
     """Feet of the common normal on both axes, its unit direction and length; any normal for parallel axes."""
     d = two.o - one.o
-    n = _cross(one.u, two.u)
+    n = cross(one.u, two.u)
     sine = float(np.linalg.norm(n))
     if sine < _FLAT:
         o2 = two.o
         o = one.o + (d @ one.u) * one.u
         e = o2 - o
         a = float(np.linalg.norm(e))
-        return o, o2, (e / a if a > 1e-12 else _across(one.u)), a
+        return o, o2, (e / a if a > 1e-12 else across(one.u)), a
     n = n / sine
     s, _, t = np.linalg.solve(np.column_stack([one.u, n, -two.u]), d)
     o, o2 = one.o + s * one.u, two.o + t * two.u
@@ -193,9 +216,13 @@ def _feet(one: Axis, two: Axis) -> tuple[Array, Array, Array, float]:
     return o, o2, (n if a >= 0 else -n), abs(a)
 
 
-def _across(u: Array) -> Array:
+def across(u: Array) -> Array:
     """A unit vector across u."""
-    return np.asarray(np.linalg.svd(u[None])[2][1])
+    k = int(np.argmin(np.abs(u)))
+    e = np.zeros(3)
+    e[k] = 1.0
+    out = e - u[k] * u
+    return np.asarray(out / sqrt(out @ out))
 
 
 def meeting_point(axes: list[Axis]) -> Array | None:
@@ -203,7 +230,7 @@ def meeting_point(axes: list[Axis]) -> Array | None:
     A = np.concatenate([np.eye(3) - np.outer(axis.u, axis.u) for axis in axes])
     b = np.concatenate([axis.o - (axis.u @ axis.o) * axis.u for axis in axes])
     p, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-9)
-    apart = max(float(np.linalg.norm(_cross(axis.u, p - axis.o))) for axis in axes)
+    apart = max(float(np.linalg.norm(cross(axis.u, p - axis.o))) for axis in axes)
     reach = max(float(np.linalg.norm(axis.o - axes[0].o)) for axis in axes)
     return np.asarray(p) if rank == 3 and apart < 1e-8 * max(reach, 1.0) else None
 
@@ -213,7 +240,7 @@ def three_turns(axes: list[Axis], R: Array) -> ThreeTurns:
     u1, u2, u3 = (axis.u for axis in axes)
     pairs, complete = two_turns(u1, u2, u3, R @ u3)
     out = []
-    side = _across(u3)
+    side = across(u3)
     for th1, th2 in pairs:
         before = R @ side
         back = turned(u2, -th2, turned(u1, -th1, before))

@@ -1,7 +1,9 @@
 """Closed-form solutions, recognised from the model: candidates for the search and proofs for the verdict.
 
 Known: chains of one to three hinges to a point (planar 2R among them), planar 3R and six hinges with a
-spherical wrist to a pose, and limbs of two bones (a ball or three meeting hinges, then one hinge) to a point.
+spherical wrist or with three parallel axes and two that meet to a pose (as UR's arms), and limbs of two bones
+(a ball or three meeting hinges, then one hinge) to a point. Axes are parallel within 1e-9 rad and meet within
+1e-8 of the chain's length.
 """
 
 from __future__ import annotations
@@ -16,7 +18,18 @@ from ...kinds import BALL, HINGE
 from ...kinematics import Frame
 from ..goals import Pose, Position
 from ..problem import Problem
-from .axes import Axis, around, linear_trig, meeting_point, point_by_three, three_turns, turn_matrix
+from .axes import (
+    Axis,
+    across,
+    around,
+    cross,
+    linear_trig,
+    meeting_point,
+    point_by_three,
+    three_turns,
+    turn_matrix,
+    two_turns,
+)
 
 Array = NDArray[np.float64]
 _SWIVELS = 12
@@ -56,7 +69,7 @@ def closed_form(problem: Problem, start: Array) -> ClosedForm | None:
     kinds = [int(j.type) for j in chain.joints]
     if isinstance(goal, Pose):
         X = np.eye(4)
-        X[:3, :3], X[:3, 3] = rotations.to_matrix(goal.quat), np.asarray(goal.position)
+        X[:3, :3], X[:3, 3] = goal.back.T, np.asarray(goal.position)
         found = _pose(chain, kinds, X)
     else:
         found = _point(chain, kinds, np.asarray(goal.target), start)
@@ -98,23 +111,76 @@ def _pose(chain: _Chain, kinds: list[int], X: Array) -> _Found | None:
     if any(kind != HINGE for kind in kinds):
         return None
     axes, G = chain.axes, X @ np.linalg.inv(chain.X0)
-    flat = all(np.linalg.norm(np.cross(a.u, axes[0].u)) < 1e-9 for a in axes)
+    flat = all(np.linalg.norm(cross(a.u, axes[0].u)) < 1e-9 for a in axes)
     if flat and len(axes) <= 3:
         return _planar_pose(axes, G, chain.X0[:3, 3])
-    if len(axes) == 6 and (w := meeting_point(axes[3:])) is not None:
+    if len(axes) != 6:
+        return None
+    if (w := meeting_point(axes[3:])) is not None:
         return _wrist(axes, G, w)
+    if (w := _parallel(axes)) is not None:
+        return _three_parallel(axes, G, w)
+    if (w := _parallel(axes[::-1])) is not None:  # the same arm from its tip, all turns the other way
+        found = _three_parallel(axes[::-1], np.linalg.inv(G), w)
+        return [[-x for x in angles[::-1]] for angles in found[0]], found[1], found[2]
     return None
+
+
+def _parallel(axes: list[Axis]) -> Array | None:
+    """Where axes 5 and 6 meet, if 2, 3 and 4 are parallel and 1 and 5 are not along them."""
+    u = axes[1].u
+    along = [np.linalg.norm(cross(axis.u, u)) < 1e-9 for axis in axes]
+    if not (along[2] and along[3]) or along[0] or along[4]:
+        return None
+    return meeting_point(axes[4:])
+
+
+def _three_parallel(axes: list[Axis], G: Array, w: Array) -> _Found:
+    """Six hinges, the middle ones along u: these keep heights along u, and u itself.
+
+    w, where axes 5 and 6 meet, is carried by joints 1 to 4 alone, so that joint 1 brings G w to the height of
+    w; joints 5 and 6 turn G's u back; the rest is planar (Hawkins 2013 for UR's arms, by sub-problems).
+    """
+    u, target = axes[1].u, G[:3, :3] @ w + G[:3, 3]
+    one = axes[0]
+    arm = target - one.o
+    mean = float(one.u @ arm) * float(one.u @ u)
+    firsts = linear_trig(
+        float(u @ arm) - mean, float(u @ cross(one.u, arm)), float(u @ (w - one.o)) - mean
+    )  # of exp(-u1 th1)
+    out, complete = [], firsts.complete
+    for back in firsts.angles:
+        M = _screw(one, back) @ G
+        pairs, all_pairs = two_turns(axes[5].u, axes[4].u, u, M[:3, :3].T @ u)
+        complete = complete and all_pairs
+        for minus_6, minus_5 in pairs:
+            E = M @ _screw(axes[5], minus_6) @ _screw(axes[4], minus_5)
+            planar = _planar_pose(axes[1:4], E, w)
+            if planar is None:
+                complete = False
+                continue
+            complete = complete and planar[1]
+            out += [[-back, *angles, -minus_5, -minus_6] for angles in planar[0]]
+    return out, complete, "three parallel axes"
+
+
+def _screw(axis: Axis, angle: float) -> Array:
+    """Turning about a line as a matrix (4, 4)."""
+    X = np.eye(4)
+    X[:3, :3] = turn_matrix(axis.u, angle)
+    X[:3, 3] = axis.o - X[:3, :3] @ axis.o
+    return X
 
 
 def _planar_pose(axes: list[Axis], G: Array, tip: Array) -> _Found | None:
     """Up to three parallel hinges: the last one's anchor is a point for the others, the rest is turning."""
     u = axes[0].u
-    phi = rotations.log(rotations.from_matrix(G[:3, :3]))
     name = f"planar {len(axes)}R"
-    if np.linalg.norm(np.cross(phi, u)) > 1e-4:
+    if np.linalg.norm(G[:3, :3] @ u - u) > 1e-4:
         return [], True, name
-    signs = [float(np.sign(a.u @ u)) for a in axes]
-    total = float(phi @ u)
+    signs = [1.0 if a.u @ u > 0 else -1.0 for a in axes]
+    side = across(u)
+    total = around(u, side, G[:3, :3] @ side) or 0.0
     if len(axes) == 1:
         return [[total]], True, name
     point = axes[-1].o
@@ -144,7 +210,7 @@ def _planar_point(axes: list[Axis], tip: Array, target: Array) -> _Found | None:
     b = tip - two.o
     a, b = a - (a @ one.u) * one.u, b - (b @ one.u) * one.u
     # |a + turn(b)|^2 = |flat|^2
-    roots = linear_trig(float(a @ b), float(a @ np.cross(two.u, b)), 0.5 * float(flat @ flat - a @ a - b @ b))
+    roots = linear_trig(float(a @ b), float(a @ cross(two.u, b)), 0.5 * float(flat @ flat - a @ a - b @ b))
     out, complete = [], roots.complete
     for th2 in roots.angles:
         arm = two.turn(th2, tip) - one.o
@@ -171,7 +237,7 @@ def _wrist(axes: list[Axis], G: Array, w: Array) -> _Found:
 def _point(chain: _Chain, kinds: list[int], target: Array, start: Array) -> _Found | None:
     axes, tip = chain.axes, chain.X0[:3, 3]
     hinges = all(kind == HINGE for kind in kinds)
-    flat = all(np.linalg.norm(np.cross(a.u, axes[0].u)) < 1e-9 for a in axes)
+    flat = all(np.linalg.norm(cross(a.u, axes[0].u)) < 1e-9 for a in axes)
     if hinges and flat and len(axes) <= 2:
         return _planar_point(axes, tip, target)
     if hinges and len(axes) == 3 and not flat:
@@ -194,7 +260,7 @@ def _two_bones(
     across = b - (b @ elbow.u) * elbow.u
     lift = a + (b @ elbow.u) * elbow.u
     rest = 0.5 * (far * far - lift @ lift - across @ across)
-    roots = linear_trig(float(lift @ across), float(lift @ np.cross(elbow.u, across)), float(rest))
+    roots = linear_trig(float(lift @ across), float(lift @ cross(elbow.u, across)), float(rest))
     out: list[list[float]] = []
     for th in roots.angles:
         arm = elbow.turn(th, tip) - c
@@ -211,7 +277,7 @@ def _two_bones(
 def _shortest(a: Array, b: Array) -> Array:
     """Quaternion of the least turn of direction a onto b."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    axis = np.cross(a, b)
+    axis = cross(a, b)
     length = float(np.linalg.norm(axis))
     if length < 1e-12:
         if a @ b > 0:
@@ -230,10 +296,9 @@ def _placed(problem: Problem, chain: _Chain, angles: list[float], start: Array) 
             q[joint.q : joint.q + 4] = rotations.multiply(rotations.multiply(parts[0], parts[1]), parts[2])
             at += 3
             continue
-        x = angles[at] + joint.rest
-        low, high = space.low[joint.v], space.high[joint.v]
-        turn = 2 * np.pi
-        near = x - turn * np.round((x - start[joint.q]) / turn)
+        x, turn = angles[at] + joint.rest, 2 * np.pi
+        low, high = float(space.low[joint.v]), float(space.high[joint.v])
+        near = x - turn * round((x - float(start[joint.q])) / turn)
         options = [near, near - turn, near + turn, x]
         inside = [o for o in options if low - 1e-9 <= o <= high + 1e-9]
         if not inside and np.isfinite(low) and np.isfinite(high):  # nearest to the range
