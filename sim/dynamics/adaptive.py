@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compile.adaptive import GUARDED, STATISTICS, adaptive_steps
+from ..compile.adaptive import adaptive_steps
 from ..compile.program import address, in_parallel
+from ..compile.step_control import GUARDED, OK, STATISTICS
 from ..errors import EngineError
 from ..integrate.tableau import Tableau
 from .laws import LinearFeedback
 from .layout import Layout
 from .loops import Guards, Loop, compiled_loop, finish
-from .path import Path
+from .path import STATUS, Path
 from .prescribed import Pieces, constant, ends, pieces_of
 from .rows import NO_MOTION, NOTHING, Controls, Prescribed, Start, control_rows, parameter_rows
 
@@ -234,9 +235,6 @@ class Follower:
 
         `offsets` are added to the guards; `jump` tells whether a jump of prescribed velocities at t0 is due.
         """
-        from ..compile.adaptive import OK
-        from .path import STATUS
-
         self._x[:], self._u[: len(u)], self._h[0], self._offsets[:] = x, u, h, offsets
         edges, of_span = self.spans.between(t0, t1, jump=jump)
         first, last = np.searchsorted(self._times, (t0, t1)).tolist()
