@@ -165,7 +165,7 @@ def test_limits_hold_for_balls_and_floating_bodies_too():
 
 
 def test_a_look_that_slides_along_the_limits_of_ball_joints_is_as_near_as_any_pose():
-    """A fly circles the puppet's head; neck and waist are balls with limits that keep the gaze from behind."""
+    """A fly circles the puppet's head; neck and waist are balls with limits that keep it from behind."""
     model, times, joints = load_model("puppet"), np.arange(0, 4, 0.1), ["neck", "waist"]
 
     def goals(t):

@@ -36,9 +36,11 @@ Array = NDArray[np.float64]
 Goals = Callable[[float], Sequence[Goal]]
 _TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference acceleration
 _REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
+_WISHED = 1e-2  # weight of wishes beside hard goals
 _STARTS = 6
 _ROUNDING = 1e-9  # of a limit
 _WALL = 100.0  # weight of the limit of a ball joint beside that of goals
+_LAST, _SMALL = 4, 1e-3  # steps that may still meet goals exactly, and their greatest length [rad or m]
 _TIGHTER = 4  # times that limits are drawn in until rotations keep them
 
 
@@ -124,6 +126,8 @@ def follow(
     q = _smoothed(line, q, limits, iterations)
     if max(_ratios(line.clip(q), line.t, line.moved, limits)) > 1.0 + _ROUNDING:
         q = _within(line, q, limits)
+    elif not line.bounded:
+        q = _tightened(line, q)
     return _motion(line, q, limits)
 
 
@@ -173,7 +177,7 @@ class _Line:
         out = []
         for problem, x in zip(self.problems, self.on_curve(q), strict=True):
             w = problem.weighted(problem.raw(x[None]))
-            weight = np.where(problem.judged, 1.0, 1e-2) / _TRACKING
+            weight = np.where(problem.judged, 1.0, _WISHED) / _TRACKING
             out.append((w.r[0] * weight, w.J[0] * weight[:, None]))
         return out
 
@@ -249,6 +253,26 @@ def _smoothed(line: _Line, q: Array, limits: Limits, iterations: int) -> Array:
         if moved < 1e-7 or (0 <= gain < 1e-9 * cost):
             break
     return q
+
+
+def _tightened(line: _Line, q: Array) -> Array:
+    """q (k, nq) with the last digits of hard goals, which wishes and smoothness bend a little, where a small
+    change of a configuration brings them."""
+    out = q.copy()
+    for k, problem in enumerate(line.problems):
+        x = q[k : k + 1]
+        for _ in range(_LAST):
+            rows = problem.raw(x)
+            w = problem.weighted(rows)
+            if problem.met(rows.r)[0]:
+                out[k] = x[0]
+                break
+            hard = problem.judged
+            d = np.linalg.lstsq(w.J[0][hard], -w.r[0][hard], rcond=1e-6)[0]
+            if np.abs(d).max(initial=0.0) > _SMALL:
+                break
+            x = line.space.step(x, d[None])
+    return out
 
 
 def _within(line: _Line, q: Array, limits: Limits) -> Array:
