@@ -1,9 +1,10 @@
 """Smooth dynamics: the equations of motion of a MuJoCo model, written once and turned into machine code."""
 
 from .laws import LinearFeedback, joint_pd
+from .machine import Stats
 from .path import STATUS, Path
 from .sensitivity import Derivatives, StepDerivatives
-from .smooth import Inputs, Smooth, Stats, compile_model
+from .smooth import Inputs, Smooth, compile_model
 from .stepper import Stepper
 from .support import differences, unsupported
 
