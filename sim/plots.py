@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from ..models import name_of
+from .engines.interface import Event
 from .errors import PantographError, unknown
 from .kinds import HINGE, SCALAR, SLIDE
 from .recording import Recording
@@ -64,7 +65,7 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
     title = recording.scene.get("title") or "recording"
     more = f" ({left} joints that move less are not drawn)" if left else ""
     chart.suptitle(f"{title}: {recording.status}{more}")
-    for event in recording.events:
+    for event in _apart(recording.events, (t[-1] - t[0]) / 20):
         if event.kind == "limit":
             axes[0].axvline(event.t, color="tab:red", lw=0.8, alpha=0.6)
         if event.kind == "contact":
@@ -76,6 +77,18 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
         ax.grid(alpha=0.3)
         ax.margins(x=0)
     return chart
+
+
+def _apart(events: Sequence[Event], gap: float) -> list[Event]:
+    """Beginnings of contacts and limits, less those that only chatter: again within ``gap`` [s]."""
+    found: list[Event] = []
+    last: dict[tuple[str, str], float] = {}
+    for event in events:
+        what = (event.kind.removesuffix(" end"), event.what)
+        if event.kind == what[0] and event.t - last.get(what, -np.inf) > gap:
+            found.append(event)
+        last[what] = event.t
+    return found
 
 
 def _chosen(recording: Recording, names: Sequence[str]) -> tuple[list[int], int]:

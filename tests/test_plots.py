@@ -5,6 +5,7 @@ import matplotlib._pylab_helpers
 import numpy as np
 import pytest
 from pantograph.sim import PantographError, Scene, plot, run
+from pantograph.sim.engines.interface import Event
 from pantograph.sim.plots import figure
 
 ARM = {
@@ -115,6 +116,17 @@ def test_first_contacts_and_limits_are_marked():
     r = run(Scene(duration=0.5, props=[ball, floor]))
     verticals = [line.get_xdata()[0] for line in figure(r).axes[3].lines if len(line.get_xdata()) == 2]
     assert verticals == [e.t for e in r.events if e.kind == "contact"]
+    # what bounces is marked at every bounce, what chatters once
+    times = {"bouncing": [0.1, 0.2, 0.4], "chattering": [0.3, 0.302, 0.31, 0.33, 0.35]}
+    events = [
+        Event(t + later, kind, what)
+        for what, begun in times.items()
+        for t in begun
+        for kind, later in (("contact", 0), ("contact end", 1e-3))
+    ]
+    r = dataclasses.replace(r, events=tuple(sorted(events, key=lambda e: e.t)))
+    verticals = [line.get_xdata()[0] for line in figure(r).axes[3].lines if len(line.get_xdata()) == 2]
+    assert verticals == [0.1, 0.2, 0.3, 0.4]
 
 
 @pytest.mark.parametrize(("ending", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])

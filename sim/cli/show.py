@@ -62,9 +62,10 @@ def summary(recording: Recording) -> Table:
         energy = recording.energy
         largest = float(np.max(np.abs(energy - energy[0])))
         table.add_row("energy", f"{energy[0]:.6g} J at first, changed by at most {largest:.3g} J")
-    if recording.events:
-        kinds = [e.kind for e in recording.events]
-        table.add_row("events", f"{kinds.count('contact')} contacts, {kinds.count('limit')} limits begun")
+    for kind in ("contact", "limit"):
+        begun = [event.what for event in recording.events if event.kind == kind]
+        if begun:
+            table.add_row(f"{kind}s begun", f"{len(begun)}, {len(set(begun))} different")
     if recording.error is not None:
         table.add_row("estimated error", error_text(recording))
     return table
