@@ -26,7 +26,7 @@ from pantograph.sim.ik.chains.iteration import arguments, layout, rows_tape
 from pantograph.sim.ik.numeric.descend import _descend
 from pantograph.sim.ik.numeric.settle import settle, settle_near
 from pantograph.sim.ik.preferences import preference
-from pantograph.sim.ik.problem import Problem
+from pantograph.sim.ik.problem import Problem, asked
 from pantograph.sim.ik.space import Space
 from strategies import random_states, seeds, trees
 
@@ -35,6 +35,12 @@ from strategies import random_states, seeds, trees
 def plain(monkeypatch):
     """Everything in NumPy."""
     monkeypatch.setattr(Problem, "prepared", lambda self, **_: None)
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """Everything compiled at once."""
+    monkeypatch.setattr(machines, "_expected", lambda problem: -1.0)
 
 
 def machine_of(problem):
@@ -286,3 +292,46 @@ def test_goals_of_ones_own_are_left_to_numpy():
     solution = solve(model, goal)
     assert solution.solved
     np.testing.assert_allclose(ik_cases.pose_of(model, solution.q, "tip")[0], [1.2, 0.6, 0], atol=1e-6)
+
+
+def test_a_changed_model_or_question_is_not_taken_for_an_earlier_one(eager):
+    """Limits, lengths, tolerances, weights and names changed in place after a first answer."""
+    model = ik_cases.planar_chain([1.0, 0.8, 0.6], [(-2.5, 2.5)] * 3)
+    goal = Position("tip", [1.2, 0.7, 0])
+    first = solve(model, goal).q
+    model.jnt_range[1] = (-2.5, -0.1) if first[1] > 0 else (0.1, 2.5)
+    second = solve(model, goal)
+    assert second.solved and ik_cases.illegal(model, second.q) == []
+    model.body_pos[2, 0] = 0.5
+    third = solve(model, goal)
+    np.testing.assert_allclose(ik_cases.pose_of(model, third.q, "tip")[0], [1.2, 0.7, 0], atol=1e-6)
+    far = Position("tip", [3.0, 0, 0])
+    assert not solve(model, far).solved
+    assert solve(model, Position("tip", [3.0, 0, 0], tolerance=(2.0, 1e-6, 1e-6))).solved
+    assert solve(model, Position("at2", [0.9, 0.2, 0])).solved
+    loose = [goal, JointValue("j0", 1.0, weight=1.0)]
+    pulled, there = solve(model, loose), solve(model, [goal, JointValue("j0", 0.2, weight=1.0)])
+    assert abs(pulled.q[0] - 1.0) < abs(there.q[0] - 1.0)
+    assert abs(there.q[0] - 0.2) < abs(pulled.q[0] - 0.2)
+    one = [Position("tip", [1.0, 0.5, 0]), Position("at2", [0.9, 0.2, 0], weight=1.0)]
+    other = [Position("at2", [0.9, 0.2, 0]), Position("tip", [1.0, 0.5, 0], weight=1.0)]
+    for goals in (one, other):
+        solution = solve(model, goals)
+        assert solution.residuals[0].met == solution.solved
+        place = ik_cases.pose_of(model, solution.q, goals[0].at)[0]
+        truth = np.linalg.norm(place - goals[0].target)
+        assert solution.residuals[0].position == pytest.approx(truth, abs=1e-9)
+        place = ik_cases.pose_of(model, solution.q, goals[1].at)[0]
+        truth = np.linalg.norm(place - goals[1].target)
+        assert solution.residuals[1].position == pytest.approx(truth, abs=1e-9)
+
+
+def test_questions_of_one_kind_do_not_disturb_each_other():
+    model = load_model("puppet")
+    problem, _ = asked(model, [Position("left_hand", [0.4, 0.3, 1.0])], None)
+    other, _ = asked(model, [Position("left_hand", [0.5, 0.1, 1.2])], None)
+    q = problem.space.check(model.qpos0)[None]
+    hand = ik_cases.pose_of(model, q[0], "left_hand")[0]
+    np.testing.assert_allclose(problem.raw(q).r[0], hand - [0.4, 0.3, 1.0], atol=1e-12)
+    np.testing.assert_allclose(other.raw(q).r[0], hand - [0.5, 0.1, 1.2], atol=1e-12)
+    assert problem.kinematics is not other.kinematics
