@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _KINDS = "qqqPPddPdPPPqqPqPPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
+_ONE_SPAN = np.array([[0, 0, 0, -1]])
 JUMP = 1e-9
 """A prescribed velocity that changes by less than this part of itself does not jump."""
 
@@ -66,8 +67,7 @@ def motion_of(smooth: Smooth, w: Prescribed, t0: float, t1: float, breaks: Array
 class Spans:
     """Time between the moments that no step may cross: samples of the controller, breaks of the motion."""
 
-    def __init__(self, smooth: Smooth, motion: Pieces):
-        lay = smooth.layout
+    def __init__(self, lay: Layout, motion: Pieces):
         self.motion = motion
         self.breaks = self.times_of_jumps = motion.knots[:0]
         self.jumps = NOTHING.array
@@ -94,7 +94,9 @@ class Spans:
         `jump` tells whether one at t0 is still to come.
         """
         if len(self.motion.knots) == 2:
-            edges: Array = t0 + (t1 - t0 if hold is None else hold) * np.arange(1.0, periods + 1)
+            if hold is None:
+                return np.array([t1]), _ONE_SPAN
+            edges: Array = t0 + hold * np.arange(1.0, periods + 1)
             edges[-1] = t1
             known = np.zeros((periods, 4), np.int64)
             known[:, 0], known[:, 3] = np.arange(periods), -1
@@ -147,7 +149,8 @@ def adaptive(
     parameters = parameter_rows(smooth, p, count)
     lanes = 1 if count == 1 else smooth.lanes
     loop = adaptive_loop(smooth, lanes, law, method)
-    spans = Spans(smooth, motion_of(smooth, w, t0, t1, breaks))
+    still = w is None and not smooth.layout.nw
+    spans = smooth.no_motion if still else Spans(smooth.layout, motion_of(smooth, w, t0, t1, breaks))
     edges, of_span = spans.between(t0, t1, hold, periods)
     motion, tolerance = spans.motion, np.full(nx, atol, dtype=float)
     path = np.full((count, len(t_eval), nx), np.nan)
@@ -212,7 +215,7 @@ class Follower:
         guards: Guards | None = None, *, max_steps: int = 10_000_000,
     ) -> None:  # fmt: skip
         nx = smooth.layout.nx
-        self.spans, self._loop = Spans(smooth, motion), adaptive_loop(smooth, 1, None, method, guards)
+        self.spans, self._loop = Spans(smooth.layout, motion), adaptive_loop(smooth, 1, None, method, guards)
         self._rtol, self._max_steps, self._times = tolerance, float(max_steps), t_eval
         self._x, self._u, self._h = np.zeros(nx), np.zeros(max(1, smooth.layout.nu)), np.zeros(1)
         self._path, self._x1 = np.zeros((len(t_eval), nx)), np.zeros(nx)

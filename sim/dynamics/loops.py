@@ -158,11 +158,14 @@ def finish(
 ) -> Path:
     """The result as it was asked for: a batch or one state."""
     rejected, status = _NONE if rejected is None else rejected, _NONE if status is None else status
-    if not math.isfinite(np.add.reduce(path[:, -1], None)):  # so may the sum of very large numbers be
+    # one number is infinite or none if any is, or if the sum of very large ones is
+    total = path[0, -1].dot(smooth.ones) if len(path) == 1 else np.add.reduce(path[:, -1], None)
+    if not math.isfinite(total):
         finite = np.isfinite(path[:, -1]).all(axis=1)
         lost = ~finite & ((status == 0) | ~np.isfinite(path[:, 0]).all(axis=1))
         status = np.where(lost, STATUS.index("not finite"), status)
-    path.flags.writeable = u.flags.writeable = False
+    path.setflags(write=False)
+    u.setflags(write=False)
     nq, nv = smooth.layout.nq, smooth.layout.nv
     if start.single:
         return Path(t, path[0], u[0], status[0], evaluations[0], rejected[0], seconds, nq, nv)

@@ -82,6 +82,7 @@ class Machine:
         self.cache = cache
         self._programs: dict[tuple[str, int], Program] = {}
         self.loops: dict[tuple[Any, ...], Loop] = {}
+        self.ones = np.ones(layout.nx)
         self.still, self.own_parameters = Rows(np.zeros(layout.nu)), Rows(self.parameter_values)
         sizes = {"q": layout.nq, "v": layout.nv, "act": layout.na, "u": layout.nu, "tau": layout.nv}
         sizes |= {"a": layout.nv, "w": layout.nw, "p": len(parameters), "bar": max(layout.nx, layout.nv)}

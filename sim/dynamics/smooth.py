@@ -10,6 +10,7 @@ Nothing is compiled before it is asked for; what was compiled once is found on d
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path as FilePath
 from typing import TypedDict, Unpack
 
@@ -21,13 +22,14 @@ from ..compile.cache import Cache, default_folder
 from ..errors import EngineError
 from ..integrate.tableau import Tableau
 from ..integrate.tableaus import DOPRI5, RK4
-from .adaptive import adaptive
+from .adaptive import Spans, adaptive
 from .fields import Parameter, parameter_index
 from .fixed import fixed
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
 from .machine import Machine
 from .path import Path
+from .prescribed import constant
 from .problem import SmoothProblem
 from .rows import Controls, Prescribed, PythonLaw, initial_states
 from .sensitivity import Derivatives, StepDerivatives, step_derivatives
@@ -96,6 +98,11 @@ class Smooth(Machine):
     Every function takes one state (1-D arrays) or a batch (2-D, leading axis); an argument given once (1-D)
     serves a whole batch.
     """
+
+    @cached_property
+    def no_motion(self) -> Spans:
+        """That nothing is prescribed."""
+        return Spans(self.layout, constant(np.zeros(0), 0.0, 1.0))
 
     def forward(
         self, q: ArrayLike, v: ArrayLike, u: ArrayLike | None = None, **inputs: Unpack[Inputs]
@@ -198,9 +205,9 @@ class Smooth(Machine):
             sampled = isinstance(controls, LinearFeedback) or callable(controls)
             one_row = not sampled and (controls is None or np.ndim(controls) == 1)  # type: ignore[arg-type]
             hold = steps if one_row else 1
-        for name, value in (("hold", hold), ("every", every)):
-            if value < 1 or steps % value:
-                raise EngineError(f"{name} is {value} steps, which must divide the {steps} steps of the run")
+        if hold < 1 or every < 1 or steps % hold or steps % every:
+            name, value = ("hold", hold) if hold < 1 or steps % hold else ("every", every)
+            raise EngineError(f"{name} is {value} steps, which must divide the {steps} steps of the run")
         start = initial_states(self, q0, v0, act0)
         return fixed(
             self, start, method=method, step=float(step), steps=steps, controls=controls, hold=hold,
@@ -235,7 +242,7 @@ class Smooth(Machine):
         shapes that do not fit and for a method without an error estimate.
         """
         times = np.ascontiguousarray(t_eval, dtype=np.float64)
-        if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
+        if times.ndim != 1 or len(times) < 2 or not (times[1:] > times[:-1]).all():
             raise EngineError("t_eval must hold two or more ascending times")
         start = initial_states(self, q0, v0, act0)
         return adaptive(
