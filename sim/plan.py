@@ -370,6 +370,9 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
         )
     elif (setup.roles == Role.KEYED).any():
         out.append("what pushes keyed joints: they cannot yield; the force their drive needs is recorded")
+    unmoved = [n for n in setup.clip.tracks if setup.roles[setup.model.joint(n).id] == Role.PASSIVE]
+    if unmoved:
+        out.append(f"keys of passive joints, but for where these start: {', '.join(unmoved)}")
     idle = [name_of(setup.model, "actuator", int(i)) for i in np.flatnonzero(setup.drives == Drive.OFF)]
     if scene.controller is not None and _period(setup) is None:
         out.append("the controller: no joint is tracked by it and no actuator driven by it")

@@ -238,3 +238,14 @@ def test_switches_leave_the_model_as_filed_alone():
     expected = flags.mjDSBL_CONTACT | flags.mjDSBL_LIMIT | flags.mjDSBL_GRAVITY
     assert plan.problem.model.opt.disableflags & expected == expected
     assert plan.setup.as_filed.opt.disableflags & expected == 0
+
+
+@pytest.mark.parametrize(
+    ("roles", "said"), [({"passive": ["*"]}, True), ({}, False), ({"tracked": ["elbow"]}, False)]
+)
+def test_keys_that_move_nothing_are_told(roles, said):
+    keys = [{"joint": "elbow", "times": [0, 1], "values": [0, 1]}]
+    left_out = make_plan(
+        Scene(duration=1, models=[{"file": "double_pendulum"}], keys=keys, roles=roles)
+    ).left_out
+    assert ("keys of passive joints, but for where these start: elbow" in left_out) == said
