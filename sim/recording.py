@@ -149,6 +149,16 @@ class Recording:
         return path
 
 
+def check_writable(folder: Path) -> None:
+    """Raise RecordingError when no recording can be saved in a folder, before work is spent on one."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as e:
+        raise RecordingError(f"cannot write into {folder}: {e.strerror}; name another folder") from None
+
+
 def load(path: str | Path) -> Recording:
     """The recording in a file, bit for bit as it was saved.
 

@@ -242,7 +242,7 @@ def test_ctrl_c_in_a_film_says_what_is_kept(pantograph, folder, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--out", "file"), "cannot write into file: File exists; name another folder with --out"),
+        (("--out", "file"), "cannot write into file: File exists; name another folder"),
         (("--out", "file/deeper"), "cannot write into file/deeper: Not a directory"),
         (("--film", "x.avi"), "cannot write '.avi' files"),
         (("--mirror", "nope"), "no rig file nope"),

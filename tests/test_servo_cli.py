@@ -23,6 +23,7 @@ from pantograph.hardware.mapping import make_mapping
 from pantograph.hardware.ports import open_port
 from pantograph.hardware.rig import check_model, parse_rig
 from pantograph.hardware.virtual import Gear, VirtualBus, VirtualServo
+from pantograph.sim.errors import RecordingError
 from pantograph.sim.recording import load
 from pantograph.sim.run import run
 from pantograph.sim.scene.schema import Scene
@@ -194,6 +195,19 @@ def test_play_in_memory_saves_the_rigs_recording(rig: Path, recording: Path) -> 
     assert result.exit_code == 0, result.output
     assert "parked, then limp" in result.output and "delay" in result.output
     assert load(out).q.shape[1] == 2
+
+
+def test_a_recording_that_could_not_be_saved_is_told_before_anything_moves(
+    rig: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = lambda *args, **_: pytest.fail("moved")  # noqa: E731
+    monkeypatch.setattr("pantograph.hardware.cli.motion.play_recording", moved)
+    monkeypatch.setattr("pantograph.hardware.mirror.teleop.teleoperate", moved)
+    (rig.parent / "file").touch()
+    for command in (("play", recording, rig), ("teleop", rig)):
+        outcome = invoke(*command, "--out", rig.parent / "file" / "rig.npz")
+        assert isinstance(outcome.exception, RecordingError)
+        assert "cannot write into" in str(outcome.exception)
 
 
 def test_play_refuses_and_says_how_to_go_on(rig: Path, recording: Path) -> None:

@@ -94,8 +94,10 @@ def play(
     out: Annotated[Path | None, typer.Option(help="Where to save the rig's own recording (.npz).")] = None,
 ) -> None:
     """Play a recording on a rig, after checking that the rig can make it."""
-    from ...sim.recording import load
+    from ...sim.recording import check_writable, load
 
+    if out is not None:
+        check_writable(out.parent)
     report = play_recording(
         load(recording), rig, slow=slow, stop=stop, port=port, take_over=take_over, paced=paced
     )
@@ -116,8 +118,11 @@ def teleop(
     out: Annotated[Path | None, typer.Option(help="Where to save the leader's recording (.npz).")] = None,
 ) -> None:
     """Move a limp rig by hand: the model, and another rig, follow."""
+    from ...sim.recording import check_writable
     from ..mirror.teleop import teleoperate
 
+    if out is not None:
+        check_writable(out.parent)
     with terminable():
         report = teleoperate(
             leader,

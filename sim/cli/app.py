@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -234,14 +233,9 @@ def schema() -> None:
 
 def _foresee(plan: Any, out: Path, film: Path | None, rig: str | None) -> None:
     """Find before the work what would spoil its end."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as e:
-        raise PantographError(
-            f"cannot write into {out}: {e.strerror}; name another folder with --out"
-        ) from None
+    from ..recording import check_writable
+
+    check_writable(out)
     if film is not None:
         from ..film import check_path
 
