@@ -15,6 +15,7 @@ from pantograph.sim.clip import Clip
 from pantograph.sim.curves import keyed
 from pantograph.sim.engines.contact import ContactEngine
 from pantograph.sim.engines.interface import Problem, Role, State
+from pantograph.sim.engines.limits import complementary
 from pantograph.sim.engines.smooth import SmoothEngine
 from scipy.integrate import solve_ivp
 
@@ -590,3 +591,44 @@ def test_a_force_acts_from_its_start_to_its_stop(tmp_path):
     forces[0] |= {"start": 0.1, "stop": 0.3}
     v = run(scene_of(tmp_path, xml, duration=0.5, forces=forces, solver={"step": 0.001})).v[-1, 0]
     np.testing.assert_allclose(v, 0.3, atol=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_impulses_push_and_velocities_part_or_the_limit_is_not_touched(seed, n):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    W, b = A @ A.T + 0.1 * np.eye(n), rng.normal(size=n)
+    x = complementary(W, b)
+    y = W @ x + b
+    assert x.min() >= 0.0
+    assert y.min() > -1e-9 * (1 + np.abs(b).max())
+    assert abs(x @ y) < 1e-8 * (1 + np.abs(x).max())
+
+
+def chain_with_limits(n, limit):
+    body = ""
+    for i in reversed(range(n)):
+        body = (
+            f'<body pos="0 0 {-0.2 if i else 0}"><joint name="j{i}" axis="0 1 0" range="-{limit} {limit}" '
+            'limited="true" damping=".01"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".3" '
+            f'contype="0" conaffinity="0"/>{body}</body>'
+        )
+    return f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>'
+
+
+@pytest.mark.parametrize(("n", "limit", "speed"), [(4, 0.1, 20.0), (5, 0.3, 15.0)])
+def test_impacts_on_joints_that_rest_on_limits_of_their_own(tmp_path, n, limit, speed):
+    """A chain is whirled into its limits: an impact on one throws others off theirs, or onto them."""
+    start = {f"j{i}": speed * (1 if i % 2 else -1) for i in range(n)}
+    scene = scene_of(tmp_path, chain_with_limits(n, limit), duration=0.15, initial={"velocity": start})
+    plan = make_plan(scene)
+    fixed, adaptive = run(plan), adaptively(plan, 1e-9)
+    assert len(adaptive.events) > 8
+    assert [(e.kind, e.what) for e in fixed.events] == [(e.kind, e.what) for e in adaptive.events]
+    times = np.array([[a.t, b.t] for a, b in zip(fixed.events, adaptive.events, strict=True)])
+    assert np.abs(times[:, 0] - times[:, 1]).max() < 1e-4
+    assert len(set(times[:, 1])) < len(times), "some of them at one time"
+    for r in (fixed, adaptive):
+        assert np.abs(r.q).max() <= limit + 1e-12
+        assert np.diff(r.energy).max() < 1e-9
+        assert r.energy[-1] < r.energy[0] - 1.0

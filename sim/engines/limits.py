@@ -28,6 +28,17 @@ class Limit:
         return float(self.side * (self.bound - q[self.qpos]))
 
 
+def complementary(W: Array, b: Array) -> Array:
+    """x >= 0 with W x + b >= 0 and x (W x + b) = 0, W symmetric and positive definite: the smallest
+    x W x / 2 + b x."""
+    from scipy.optimize import nnls
+
+    if not len(b):
+        return np.zeros(0)
+    L = np.linalg.cholesky(W)
+    return np.asarray(nnls(L.T, -np.linalg.solve(L, b))[0])
+
+
 def slack(force: Array) -> Array:
     """What a limit may pull before it lets go [N, N m]: more than rounding, so that it does so once."""
     return np.asarray(1e-9 * (1.0 + np.abs(force)))

@@ -13,7 +13,7 @@ from ...models import name_of
 from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
 from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
-from .limits import Limit, limits_of, slack
+from .limits import Limit, complementary, limits_of, slack
 from .smooth import RESTITUTION, friction_width, mobility
 from .timed import Timed
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 NARROW = 1e-12
 """Moments of events are known to this share of their step."""
+
+
+TOUCHING = 1e-9
+"""Joints this near to a limit [rad, m] take part in an impact."""
 
 
 class Moment(NamedTuple):
@@ -85,15 +89,16 @@ class Run:
         """Speed below which dry friction is smoothed."""
         return friction_width(self.problem.model, mobility(self.problem), self.h)
 
-    def model(self) -> Compiled:
+    def model(self, resting: tuple[Limit, ...] | None = None) -> Compiled:
         """The compiled model, with the joints that rest at a limit taken out of the unknowns."""
-        if self.resting not in self.compiled:
+        resting = self.resting if resting is None else resting
+        if resting not in self.compiled:
             begun = time.perf_counter()
-            self.compiled[self.resting] = Compiled(
-                self.problem, self.timed, self.t0, self.method, width=self.width, resting=self.resting
+            self.compiled[resting] = Compiled(
+                self.problem, self.timed, self.t0, self.method, width=self.width, resting=resting
             )
             self.build_s += time.perf_counter() - begun
-        return self.compiled[self.resting]
+        return self.compiled[resting]
 
     def sample(self, k: int) -> None:
         """Sample the controller at its tick ``k``."""
@@ -145,7 +150,10 @@ class Run:
             last = float(brentq(closing, 0.0, 1.0, xtol=1e-9))
             if gap(last) >= 0.0:
                 return None
-        return 0.0 if gap(0.0) <= 0.0 else float(brentq(gap, 0.0, last, xtol=NARROW))
+        # where it stands on the limit, it may leave and come back
+        starts = (0.0,) if gap(0.0) > 0.0 or last < 1.0 else (1e-3, 0.03, 0.1, 0.3, 0.6, 0.9)
+        first = next((share for share in starts if gap(share) > 0.0), None)
+        return 0.0 if first is None else float(brentq(gap, first, last, xtol=NARROW))
 
     def _force(self, i: int, share: float, length: float) -> float:
         """Force of the limit on the joint that rests on it, a share of the step from here."""
@@ -184,9 +192,7 @@ class Run:
 
     def happen(self, moment: Moment) -> None:
         """The event at the current state."""
-        if moment.met:
-            self._impact(moment.limit)
-        self.release()
+        self._settle(moment.limit if moment.met else None)
 
     def limit_forces(self, offset: float, q: Array, v: Array, act: Array) -> Array:
         """Forces (resting,) that the limits give, positive away from them."""
@@ -202,34 +208,54 @@ class Run:
         return np.asarray(sides * (pushed - drive[:, at]) + slack(pushed))
 
     def release(self) -> None:
-        """Let joints go that their limits would have to pull; the one pulled most first."""
-        while self.resting:
-            forces = self.limit_forces(self.offset, self.q, self.v, self.act)
-            worst = int(np.argmin(forces))
-            if forces[worst] >= 0:
-                return
-            gone = self.resting[worst]
-            self.resting = tuple(limit for limit in self.resting if limit is not gone)
-            self._note("limit end", gone)
+        """Let joints go that their limits would have to pull."""
+        if self.resting and (self.limit_forces(self.offset, self.q, self.v, self.act) < 0).any():
+            self._settle(None)
 
-    def _impact(self, limit: Limit) -> None:
-        """Impulse on the joint: its velocity becomes -RESTITUTION times what it was; with none it rests.
+    def _settle(self, hit: Limit | None) -> None:
+        """An impact on the limit ``hit``, if any, and which joints rest on their limits from here on.
 
-        v+ = v - (1 + e) M^-1 J' (J M^-1 J')^-1 J v (R. Featherstone, Rigid Body Dynamics Algorithms, 11.7),
-        over the freedoms that are neither keyed nor at rest.
+        Of the joints at their limits, impulses p and velocities u away from them satisfy u+ = u + W p >= 0,
+        p >= 0, p u+ = 0, W = J M^-1 J' (with restitution e: W p + (1 + e) u in place of u+); of those that
+        stay, forces and accelerations do likewise (R. Featherstone, Rigid Body Dynamics Algorithms, ch. 11).
         """
-        c = self.model()
-        w = np.zeros(c.nw)
-        w[: len(c.q_keyed)] = self.q[c.q_keyed]
-        M = c.smooth.mass_matrix(self.q[c.q_free], w=w)
-        j = (c.v_free == limit.dof).astype(float)
-        response = np.linalg.solve(M, j)
-        self.v[c.v_free] -= (1.0 + RESTITUTION) * self.v[limit.dof] / (j @ response) * response
-        self.q[limit.qpos] = limit.bound
-        if RESTITUTION == 0.0:
-            self.v[limit.dof] = 0.0
-            self.resting = (*self.resting, limit)
-        self._note("limit", limit)
+        gaps = self.limits.gaps(self.q[None])[0]
+        at = [
+            limit
+            for limit, gap in zip(self.limits.each, gaps, strict=True)
+            if gap <= TOUCHING or limit is hit
+        ]
+        c = self.model(())
+        side = -np.array([limit.side for limit in at], dtype=float)
+        dof = np.array([int(np.flatnonzero(c.v_free == limit.dof)[0]) for limit in at])
+        w = c.at(np.array([self.offset]))[0]
+        inverse = np.linalg.inv(c.smooth.mass_matrix(self.q[c.q_free], w=w))[:, dof] * side
+        W = side[:, None] * inverse[dof]
+        stays = np.ones(len(at), dtype=bool)
+        if hit is not None:
+            self._note("limit", hit)
+            self.q[hit.qpos] = hit.bound
+            u = side * self.v[c.v_free[dof]]
+            p = complementary(W, (1.0 + RESTITUTION) * u)
+            self.v[c.v_free] += inverse @ p
+            stays = u + W @ p <= 1e-12 * (1.0 + np.abs(u).max())
+            self.v[c.v_free[dof[stays]]] = 0.0
+        a = c.smooth.forward(self.q[c.q_free], self.v[c.v_free], c.held(self.held), act=self.act, w=w)
+        away, W = side[stays] * a[dof[stays]], W[np.ix_(stays, stays)]
+        force = complementary(W, away)
+        # what a limit may pull accelerates its joint by least when all the others stay
+        rests = (force > 0) | (away + W @ force <= 0.5 * slack(force) / np.diag(np.linalg.inv(W)))
+        kept = tuple(
+            limit for limit, stay in zip(np.array(at, dtype=object)[stays], rests, strict=True) if stay
+        )
+        for limit in kept:
+            self.q[limit.qpos] = limit.bound
+            if limit is not hit and limit not in self.resting:
+                self._note("limit", limit)
+        for limit in at:
+            if limit not in kept and (limit is hit or limit in self.resting):
+                self._note("limit end", limit)
+        self.resting = kept
 
     def _note(self, kind: str, limit: Limit) -> None:
         self.events.append(Event(self.now, kind, name_of(self.problem.model, "joint", limit.joint)))
