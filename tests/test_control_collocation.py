@@ -1,16 +1,21 @@
 """Fitted motion obeys the machine: known optima, limits, passive joints, hard keys, and simulation."""
 
+import re
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from pantograph.controllers.fit import Phase, check, fit, machine, prove
+from pantograph.controllers.fit.task import task_of
 from pantograph.models import load_model
 from pantograph.sim import PantographError, load
 from pantograph.sim.clip import Clip, FreeTrack
 from pantograph.sim.curves import keyed
 from pantograph.sim.rotation_curves import keyed_rotation
 from pantograph.sim.rotations import conjugate, exp, log, multiply, normalize
+from pantograph.sim.scene.load import load_scene
 from strategies import seeds
 from typer.testing import CliRunner
 
@@ -227,6 +232,7 @@ def test_a_hopper_with_a_free_base_hops():
             need -= J.T @ f[3 * k : 3 * k + 3]
         missing = max(missing, np.abs(need - tau).max())
     assert missing < 1e-6 * largest
+    assert prove(found, able).worst < 0.1  # under servos, with MuJoCo's contacts
 
 
 @pytest.mark.parametrize(
@@ -259,7 +265,8 @@ def test_the_command_checks_retimes_and_fits(tmp_path):
     base = [str(scene), "--velocity", "2", "--out", str(tmp_path)]
     done = run.invoke(app, [*base, "--how", "check"])
     assert done.exit_code == 1
-    assert "shoulder: velocity 2.25" in done.output
+    assert "as keyed: impossible" in done.output
+    assert re.search(r"shoulder +velocity +2\.25 +2 +112\.5%", done.output)
     done = run.invoke(app, [*base, "--how", "nearest"])
     assert done.exit_code == 0, done.output
     recording = load(tmp_path / "swing.fit.npz")
@@ -268,3 +275,40 @@ def test_the_command_checks_retimes_and_fits(tmp_path):
     done = run.invoke(app, [*base, "--how", "fit", "--force", "100", "--hard", "1"])
     assert done.exit_code == 0, done.output
     assert "LQR in the loop" in done.output
+    done = run.invoke(app, [*base, "--how", "retime", "--jerk", "40"])
+    assert done.exit_code == 0, done.output
+    assert re.search(r"elbow +jerk +\S+ +40 +\d", done.output)
+
+
+def test_a_scene_says_machine_and_contacts(tmp_path):
+    """The table [fit] stands for the options; the film has the keys on the left."""
+    import typer
+    from pantograph.controllers.fit.command import fit as command
+
+    app = typer.Typer()
+    app.command()(command)
+    scene = tmp_path / "sway.toml"
+    scene.write_text(
+        'duration = 0.4\n[[models]]\nfile = "planar_2r"\n[film]\nwidth = 64\nheight = 48\n'
+        '[[keys]]\njoint = "shoulder"\ntimes = [0, 0.4]\nvalues = [-1.0, -0.7]\n'
+        '[fit]\nhow = "fit"\nhard = [0.4]\nforce = 70\nvelocity = {shoulder = 1.4}\n'
+    )
+    run = CliRunner()
+    done = run.invoke(app, [str(scene), "--out", str(tmp_path), "--film", "sway.gif"])
+    assert done.exit_code == 0, done.output
+    assert "certificate to 0.001 holds" in done.output
+    assert (tmp_path / "sway.gif").exists()
+    assert np.abs(load(tmp_path / "sway.fit.npz").v[:, 0]).max() <= 1.4 * (1 + 1e-3)
+    done = run.invoke(app, [str(scene), "--out", str(tmp_path), "--how", "check", "--velocity", "5"])
+    assert re.search(r"elbow +velocity +0 +5 ", done.output)
+    scene.write_text(scene.read_text() + '[[fit.phases]]\nsites = ["tipp"]\nstart = 0\nstop = 0.2\n')
+    with pytest.raises(PantographError, match="no site 'tipp'"):
+        run.invoke(app, [str(scene)], catch_exceptions=False)
+
+
+def test_the_jump_as_drawn_needs_what_nothing_gives():
+    scene = load_scene(Path(__file__).parents[1] / "models" / "scenes" / "hopper_jump.toml")
+    task = task_of(scene)
+    crossed = {v.who for v in check(task.clip, task.machine, phases=task.phases).violations}
+    assert {"root.x", "root.z", "root.ry"} <= crossed
+    assert not crossed & {"root.y", "root.rx", "root.rz"}

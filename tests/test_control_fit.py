@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pantograph.controllers.fit import check, machine, retime
+from pantograph.controllers.fit import Phase, check, machine, retime
 from pantograph.controllers.fit.check import forces
 from pantograph.models import load_model
 from pantograph.sim import PantographError
@@ -138,6 +138,56 @@ def test_the_path_stays_the_same(seed):
     np.testing.assert_allclose((ahead.v - behind.v) / h, a[inner][1:-1], atol=1e-3)
 
 
+@given(st.floats(0.1, 2.5), st.floats(5.0, 200.0), st.sampled_from(["linear", "clamped", "auto"]))
+@settings(max_examples=6)
+def test_bounded_jerk_takes_four_equal_parts(d, jerk, kind):
+    """From rest to rest with jerk alone bounded: + - - +, T = (32 d / j)^(1/3), however it is keyed."""
+    clip = Clip(ARM, {"shoulder": keyed([0, 1], [0, d], kind=kind)}, ARM.qpos0)
+    found = retime(clip, machine(ARM, jerk=jerk, force=np.inf), points=400)
+    closed = np.cbrt(32 * d / jerk)
+    assert closed * (1 - 1e-6) <= found.duration <= closed * 1.01
+    assert found.report.possible
+
+
+@pytest.mark.parametrize(("seed", "kind"), [(0, "natural"), (2, "clamped"), (3, "auto")])
+def test_jerk_holds_with_all_other_limits(seed, kind):
+    """By plain differences and MuJoCo's inverse dynamics on a grid of its own; the path is the keyed one."""
+    limits = {"velocity": 2.0, "acceleration": 9.0, "force": {"shoulder": 90.0, "elbow": 25.0}}
+    clip, tight = arm_clip(seed, kind=kind, keys=3), machine(ARM, **limits, jerk=80.0)
+    found = retime(clip, tight, points=400)
+    assert found.report.possible
+    assert found.duration > retime(clip, machine(ARM, **limits), points=400).duration
+    t = np.linspace(0, found.duration, 5001)[:-1]
+    q, v, a = found.clip.evaluate(t)
+    assert np.abs(v).max() <= 2.0 * (1 + 1e-4)
+    assert np.abs(a).max() <= 9.0 * (1 + 1e-3)
+    assert np.abs(a[0]).max() <= 1e-6
+    assert (np.abs(np.diff(a, axis=0)) / t[1]).max() <= 80.0 * (1 + 1e-3)
+    np.testing.assert_allclose(np.diff(v, axis=0) / t[1], 0.5 * (a[1:] + a[:-1]), atol=1e-2)
+    data = mujoco.MjData(tight.model)
+    for row in zip(q[::10], v[::10], a[::10], strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = row
+        mujoco.mj_inverse(tight.model, data)
+        assert (np.abs(data.qfrc_inverse) <= np.array([90.0, 25.0]) * (1 + 1e-3)).all()
+    way = clip.evaluate(np.linspace(0, 2, 20001)).q
+    off = max(np.abs(way - row).max(axis=1).min() for row in q[::100])
+    assert off < 2e-4
+    np.testing.assert_allclose(found.clip.evaluate(found.duration).q, clip.evaluate(2.0).q, atol=1e-9)
+
+
+def test_a_missing_drive_is_a_violation():
+    """A keyed joint without a drive, and what it would need: here its weight, or the ground's push."""
+    still = Clip(ARM, {"elbow": keyed([0, 1], [0.0, 0.0])}, ARM.qpos0)
+    able = machine(ARM, driven=np.array([True, False]))
+    report = check(still, able)
+    assert [v.kind for v in report.violations] == ["missing force"]
+    assert report.violations[0].value == pytest.approx(abs(able.nominal.weight(ARM.qpos0)[1]), rel=1e-9)
+    ground = Phase(0.0, 1.0, ("tip",), ground=None)
+    assert check(still, able, phases=[ground]).possible
+    late = Phase(0.5, 1.0, ("tip",), ground=None)
+    assert check(still, able, phases=[late]).violations[0].stop == pytest.approx(0.5, abs=1e-3)
+
+
 def test_a_battery_bounds_the_sum_of_currents():
     clip, ampere = arm_clip(3), {"shoulder": 0.1, "elbow": 0.2}
     free = retime(clip, machine(ARM, velocity=3.0), points=200)
@@ -145,7 +195,6 @@ def test_a_battery_bounds_the_sum_of_currents():
     found = retime(clip, tight, points=200)
     assert found.duration > free.duration
     tau = forces(found.clip.evaluate(np.linspace(0, found.duration, 3001)), tight)
-    assert np.abs(tau) @ [0.1, 0.2] == pytest.approx(9.0, abs=9.1)
     assert (np.abs(tau) @ np.array([0.1, 0.2])).max() <= 9.0 * (1 + 1e-4)
 
 
@@ -182,9 +231,8 @@ def test_check_says_where_and_by_how_much():
     ("clip", "limits", "words"),
     [
         (line(1.0), {"force": 1.0}, "joint 'shoulder' cannot hold the pose at 0.000 s"),
-        (line(3.5), {"velocity": 1.0}, "no timing helps: shoulder: position 0.4"),
+        (line(3.5), {"velocity": 1.0}, "no timing helps: shoulder: 0.4 rad or m beyond"),
         (arm_clip(0, kind="step"), {"velocity": 1.0}, "the path jumps at"),
-        (line(1.0), {"jerk": 5.0}, "does not bound jerk"),
         (line(1.0), {"velocity": {"sholder": 1.0}}, "did you mean 'shoulder'"),
         (line(1.0), {"velocity": -1.0}, "must be a number >= 0"),
         (line(1.0), {"velocity": 0.0}, "must be positive"),

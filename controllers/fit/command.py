@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -53,41 +54,32 @@ def fit(
     Machine and contacts stand in the scene's table [fit]; options go before it.
     """
     from ...sim.cli import show
-    from ...sim.plan import make_plan
-    from ...sim.scene.fitting import FitItem
     from ...sim.scene.load import load_scene
-    from . import Phase, check, machine
+    from . import check
+    from .task import LIMITS, task_of
 
     loaded = load_scene(scene)
-    item = loaded.fit or FitItem()
-    how = how or item.how
+    how = how or (loaded.fit.how if loaded.fit else "check")
     if how not in WAYS:
         raise PantographError(f"no way {how!r} to fit; there is: {', '.join(WAYS)}")
-    plan = make_plan(loaded)
-    if item.phases:
-        plan = make_plan(_touching(plan))
-    clip, model = plan.problem.clip, plan.problem.model
+    texts = dict(zip(LIMITS, (velocity, acceleration, jerk, force, top_speed, ampere), strict=True))
+    limits = {word: _limit(text) for word, text in texts.items() if text}
+    task = task_of(loaded, **limits, current=current, passive=passive, hard=hard)
+    clip, able, phases = task.clip, task.machine, task.phases
     if not clip.end > clip.start:
         raise PantographError(f"{scene} keys no motion: no joint has two keys")
-    given = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "force": force}
-    given |= {"top_speed": top_speed, "ampere": ampere}
-    limits: dict[str, Any] = {k: _limit(v) if v else getattr(item, k) for k, v in given.items()}
-    most = current or item.current or math.inf
-    able = machine(model, driven=_driven(model, passive or item.passive), current=most, **limits)
-    phases = tuple(Phase(p.start, p.stop, tuple(p.sites), p.friction, p.ground) for p in item.phases)
     report = check(clip, able, phases=phases)
     console.print(_table(report, "as keyed"))
     _advise(report, phases)
     if how == "check":
         raise typer.Exit(0 if report.possible else 1)
     if how == "fit":
-        words = {k: getattr(item, k) for k in ("effort", "deviation", "step", "tolerance", "at_rest")}
         with show.status(f"fitting {scene.stem}") as tell:
-            new, good = _fit(clip, able, hard or item.hard, phases, words, tell)
+            new, good = _fit(task, tell)
     else:
         with show.status(f"retiming {scene.stem}"):
             new, good = _retime(clip, able, how == "nearest")
-    before, after = _recording(plan, clip), _recording(plan, new)
+    before, after = _recording(task.plan, clip), _recording(task.plan, new)
     console.print(f"recording: {after.save(out / f'{scene.stem}.fit.npz')}")
     if film is not None:
         from ...sim.shoot import shoot
@@ -98,19 +90,19 @@ def fit(
     raise typer.Exit(0 if good else 1)
 
 
-def _fit(clip: Any, able: Any, hard: Any, phases: Any, words: dict[str, Any], tell: Any) -> tuple[Any, bool]:
+def _fit(task: Any, tell: Any) -> tuple[Any, bool]:
     from . import fit as solve
     from . import prove
 
-    found = solve(clip, able, hard=hard, phases=phases, progress=tell, **words)
+    found = solve(task.clip, task.machine, hard=task.hard, phases=task.phases, progress=tell, **task.words)
     console.print(f"fitted: up to {found.deviation:.3g} rad or m from the keys")
     console.print(str(found.certificate), soft_wrap=True, style="" if found.certificate.holds else "yellow")
     if tell is not None:
         tell("simulating")
-    proof = prove(found, able)
-    law = "servos" if phases else "LQR"
+    proof = prove(found, task.machine)
+    law = "contacts and servos" if task.phases else "LQR"
     console.print(
-        f"simulated with contacts and {law} in the loop: within {proof.worst:.3g} rad or m of the fitted "
+        f"simulated with {law} in the loop: within {proof.worst:.3g} rad or m of the fitted "
         f"motion, drives at their limits {proof.saturated:.0%} of the time",
         soft_wrap=True,
     )
@@ -130,7 +122,7 @@ def _retime(clip: Any, able: Any, keep: bool) -> tuple[Any, bool]:
 def _table(report: Any, title: str) -> Table:
     """Every limit of the machine, the worst first; ranges and missing forces where they are crossed."""
     verdict = "possible" if report.possible else "impossible"
-    table = Table(title=f"{title}: {verdict}", title_justify="left")
+    table = Table(title=f"{title}: {verdict}", title_justify="left", box=SIMPLE, pad_edge=False)
     for head in ("joint", "what", "largest", "limit", "in use", "at s", "crossed, s"):
         right = head not in ("joint", "what")
         table.add_column(head, justify="right" if right else "left", no_wrap=True)
@@ -180,30 +172,6 @@ def _recording(plan: Any, clip: Any) -> Any:
     kinematic = Choice("kinematic", "the motion is known")
     setup = replace(plan.setup, roles=roles, clip=clip)
     return run(replace(plan, setup=setup, problem=problem, engine=kinematic, period=None))
-
-
-def _touching(plan: Any) -> Any:
-    """The scene with its joints tracked: between parts that are all keyed a plan leaves contacts out."""
-    from ...models import names_of
-    from ...sim.kinds import FREE
-
-    model, scene = plan.problem.model, plan.setup.scene
-    names = names_of(model, "joint")
-    mine = [n for n in plan.problem.clip.tracks if int(model.jnt_type[names.index(n)]) != FREE]
-    return scene.model_copy(update={"roles": scene.roles.model_copy(update={"tracked": mine, "keyed": []})})
-
-
-def _driven(model: Any, passive: list[str]) -> Any:
-    """Mask (nv,) of the freedoms with a drive: all but those of free joints and of the ``passive`` ones."""
-    import numpy as np
-
-    from ...models import lookup
-    from ...sim.kinds import FREE
-
-    driven = np.asarray(model.jnt_type[model.dof_jntid] != FREE)
-    for name in passive:
-        driven[model.dof_jntid == lookup(model, "joint", name)] = False
-    return driven
 
 
 def _limit(texts: list[str]) -> float | dict[str, float]:

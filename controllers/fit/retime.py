@@ -10,6 +10,7 @@ round is feasible and faster than the one before.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from ...sim.curves import Curve
 from ...sim.errors import PantographError
 from .check import Report, check_motion, forces
 from .machine import Machine
+from .smooth import smooth
 
 Array = NDArray[np.float64]
 _FLOOR = 1e-9  # x below this part of its bound counts as standing still when sqrt(x) is bounded
@@ -69,11 +71,11 @@ def retime(
 
     Limits of velocity, acceleration, force (with the motor's top speed) and current hold; the path does not
     change, and stretches where nothing moves keep their length. It starts and ends ``at_rest``, or at the
-    keyed speed. Raises PantographError where the path itself is impossible (positions out of range, a pose
-    that the drives cannot hold), for a limit on jerk (which needs a fit), and for freedoms without a drive.
+    keyed speed. With a limit on jerk it stops where the path's curvature jumps, as it does at the keys of
+    curves that are not natural or clamped, and the motion is quintics through points of the path. Raises
+    PantographError where the path itself is impossible (positions out of range, a pose that the drives cannot
+    hold), and for freedoms without a drive.
     """
-    if np.isfinite(machine.jerk).any():
-        raise PantographError("retiming does not bound jerk: leave that limit out, or fit the motion instead")
     if not machine.driven.all():
         raise PantographError("retiming needs a drive at every moving joint: fit the motion instead")
     grid = _Grid(clip, machine, points)
@@ -84,6 +86,8 @@ def retime(
         x = better
         if done:
             break
+    if np.isfinite(machine.jerk).any():
+        return grid.slowed(*smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points))
     return grid.result(x)
 
 
@@ -101,7 +105,7 @@ class _Grid:
         gap = np.abs(begin.q[1:] - end.q[:-1]).max(axis=1, initial=0.0) > 1e-9
         if gap.any():
             raise PantographError(f"no timing helps: the path jumps at {self.s[1:-1][gap][0]:.4g} s")
-        rows0, rows1 = self._rows(begin), self._rows(end)
+        rows0, rows1 = self.rows(begin), self.rows(end)
         # at the end of a piece x has become x + 2 h u
         a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
         self.a, self.b, self.c, self.e = (
@@ -116,6 +120,7 @@ class _Grid:
         self.cap = np.minimum(np.append(cap0, np.inf), np.append(np.inf, cap1))
         top = np.max(np.abs(np.vstack([begin.v, end.v])), initial=0.0)
         still = np.abs(begin.v).max(axis=1) + np.abs(end.v).max(axis=1) <= 1e-9 * top
+        self.still = still
         resting = np.append(still, False) | np.append(False, still)
         self.cap = np.where(resting, np.minimum(self.cap, 1.0), np.minimum(self.cap, 1e8))
         # where the path has a corner, nothing but a stop goes round it
@@ -126,7 +131,7 @@ class _Grid:
             bool(np.any(np.abs(end.v[-1]) > 1e-9 * top)),
         )
 
-    def _rows(self, at: Motion) -> tuple[Array, Array, Array, Array]:
+    def rows(self, at: Motion) -> tuple[Array, Array, Array, Array]:
         """a, b, c, e (n, rows) of the limits at states of the path."""
         m = self.machine
         a: list[Array] = []
@@ -218,25 +223,34 @@ class _Grid:
         rate = np.sqrt(x)
         steps = 2.0 * self.h / np.maximum(rate[:-1] + rate[1:], 1e-300)
         bend = 0.5 * np.diff(x) / self.h
-        slow = 1.0
-        for _ in range(20):
+
+        def at(slow: float) -> tuple[Array, Clip]:
             t = np.concatenate([[0.0], np.cumsum(steps)]) * slow
-            clip = self._clip(t, rate / slow, bend / slow**2)
-            fine = np.interp(np.arange(10 * len(self.h) + 1) / 10.0, np.arange(len(t)), t)
-            report = check_motion(fine, clip.evaluate(fine), self.machine, keyed=clip.dofs)
+            return t, self._clip(t, rate / slow, bend / slow**2)
+
+        return self.slowed(at, self.s)
+
+    def slowed(self, at: Callable[[float], tuple[Array, Clip]], s: Array) -> Retimed:
+        """The clip ``at`` the least slowdown with which it holds on a grid ten times finer."""
+        slow = 1.0
+        for _ in range(30):
+            t, clip = at(slow)
+            fine = np.interp(np.arange(10 * (len(t) - 1) + 1) / 10.0, np.arange(len(t)), t)
+            now = clip.evaluate(fine)
+            last = clip.evaluate(fine[-1:], left=True)
+            for row, end in zip(now, last, strict=True):
+                row[-1:] = end
+            report = check_motion(fine, now, self.machine, keyed=clip.dofs)
             # accelerations fall with the square of the slowdown; a force has a part that does not fall at all
-            excess = max((v.share for v in report.violations if v.kind != "position"), default=1.0)
-            if excess <= 1.0 + 5e-7:
+            over = [v for v in report.violations if v.kind != "position"]
+            if max((v.share for v in over), default=1.0) <= 1.0 + 5e-7:
                 break
-            slow *= max(
-                np.sqrt(v.share) if v.kind == "acceleration" else v.share
-                for v in report.violations
-                if v.kind != "position"
-            )
+            powers = {"acceleration": 2.0, "jerk": 3.0}
+            slow *= max(v.share ** (1.0 / powers.get(v.kind, 1.0)) for v in over)
         out_of_range = [v for v in report.violations if v.kind == "position"]
         if out_of_range and out_of_range[0].value > 1e-9:
             raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
-        return Retimed(clip, float(t[-1]), report, self.s, t)
+        return Retimed(clip, float(t[-1]), report, s, t)
 
     def _clip(self, t: Array, rate: Array, bend: Array) -> Clip:
         def follow(curve: Curve) -> Curve:

@@ -7,17 +7,20 @@ import time
 from pathlib import Path
 
 import numpy as np
-from control_figures import Figure, at_most, info
-from pantograph.controllers.fit import fit, machine, prove, retime
+from control_figures import Figure, at_least, at_most, info
+from pantograph.controllers.fit import check, fit, machine, prove, retime
+from pantograph.controllers.fit.task import task_of
 from pantograph.models import ModelError, load_model
 from pantograph.sim.clip import Clip
 from pantograph.sim.curves import keyed
+from pantograph.sim.scene.load import load_scene
 from rich.console import Console
 from rich.progress import track
 
 PATHS, KEYS, SECONDS = 100, 6, 4.0
 POINTS = (250, 1000)
-SPEED, BEND = 3.0, 10.0  # rad/s, rad/s^2
+SPEED, BEND, JERK = 3.0, 10.0, 100.0  # rad/s, rad/s^2, rad/s^3
+SCENES = Path(__file__).parents[2] / "models" / "scenes"
 VENV = Path(".bench/toppra")
 
 
@@ -82,35 +85,55 @@ def retiming(console: Console) -> list[Figure]:
     return figures
 
 
-def fitting(console: Console) -> list[Figure]:
-    """Impossible keys made possible: a pick at a torque limit, an acrobot's swing; certified, simulated."""
-    arm, acrobot = load_model("planar_2r"), load_model("acrobot")
-    up = {
-        "shoulder": keyed([0, 4], [0, np.pi], kind="clamped"),
-        "elbow": keyed([0, 4], [0, 0], kind="clamped"),
-    }
-    pick = {"shoulder": keyed([0, 0.5, 1], [-1.2, 0.3, 0.8], kind="clamped")}
-    pick["elbow"] = keyed([0, 0.5, 1], [0.5, 1.8, 0.2], kind="clamped")
-    weak = machine(arm, force={"shoulder": 85.0, "elbow": 25.0})
-    free = machine(acrobot, driven=np.array([False, True]), force={"elbow": 15.0})
-    cases = {
-        "pick at a torque limit": (Clip(arm, pick, arm.qpos0), weak, {"hard": [1.0]}),
-        "swing of the acrobot": (Clip(acrobot, up, acrobot.qpos0), free, {"hard": [4.0], "deviation": 0.1}),
-    }
-    figures = []
-    for name, (clip, able, words) in cases.items():
+def smooth(console: Console) -> list[Figure]:
+    """Ten of the same clips with a limit on jerk: what it costs in duration, and to compute."""
+    try:
+        model = load_model("wx250s")
+    except ModelError:
+        return [Figure("bounded jerk: wx250s present", 0.0, "", "present", False)]
+    names = [model.joint(j).name for j in range(6)]
+    rng, times = np.random.default_rng(0), np.linspace(0.0, SECONDS, KEYS)
+    limits = {"velocity": dict.fromkeys(names, SPEED), "acceleration": dict.fromkeys(names, BEND)}
+    able = machine(model, **limits, jerk=dict.fromkeys(names, JERK), force=np.inf)
+    free = machine(model, **limits, force=np.inf)
+    share, longer, seconds = 0.0, [], []
+    for path in track(list(rng.uniform(-0.9, 0.9, (10, KEYS, 6))), "bounded jerk", console=console):
+        tracks = {n: keyed(times, path[:, j], kind="natural") for j, n in enumerate(names)}
+        clip = Clip(model, tracks, model.qpos0)
         begun = time.perf_counter()
-        found = fit(clip, able, **words)
+        found = retime(clip, able, points=1000)
+        seconds.append(time.perf_counter() - begun)
+        longer.append(found.duration / retime(clip, free, points=1000).duration)
+        share = max(share, found.report.worst)
+    return [
+        at_most("bounded jerk: largest share of a limit, grid x 10", share - 1.0, 1e-6, ""),
+        info("bounded jerk: duration / that without, median", float(np.median(longer)), ""),
+        info("bounded jerk: our time, median", float(np.median(seconds)), "s"),
+    ]
+
+
+def fitting(console: Console) -> list[Figure]:
+    """Scenes with impossible keys made possible: a pick, a swing, a jump; certified, and simulated."""
+    figures = []
+    for name, near in (("two_link_pick", 0.01), ("acrobot_swing", 0.01), ("hopper_jump", 0.05)):
+        task = task_of(load_scene(SCENES / f"{name}.toml"))
+        drawn = check(task.clip, task.machine, phases=task.phases)
+        begun = time.perf_counter()
+        found = fit(task.clip, task.machine, hard=task.hard, phases=task.phases, **task.words)
         seconds = time.perf_counter() - begun
-        proof = prove(found, able)
+        proof = prove(found, task.machine)
         console.print(f"{name}: {found.certificate}")
         figures += [
+            at_least(f"{name}: limits that the keys cross", len(drawn.violations), 1, ""),
             at_most(f"{name}: share of limits in use, grid x 10", found.certificate.limits, 1.001, ""),
             at_most(f"{name}: force missing, relative", found.certificate.dynamics, 1e-3, ""),
-            at_most(f"{name}: simulated with LQR, largest error", proof.worst, 0.01, "rad"),
+            at_most(f"{name}: resting sites stray", found.certificate.contact, 1e-3, "m"),
+            at_most(
+                f"{name}: simulated with the law in the loop, largest error", proof.worst, near, "rad, m"
+            ),
             info(f"{name}: time of the fit", seconds, "s"),
         ]
     return figures
 
 
-PARTS = {"retiming": retiming, "fitting": fitting}
+PARTS = {"retiming": retiming, "smooth": smooth, "fitting": fitting}
