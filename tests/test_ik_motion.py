@@ -199,7 +199,7 @@ def test_halving_the_tick_halves_the_steps_also_past_singularities(seed):
             last = tick.q
     times = np.arange(0, 1.0, 0.05)
     goals = [[Pose("tip", p + way * np.sin(2 * np.pi * t), quat)] for t in times]
-    motion = follow(model, lambda t: goals[round(t / 0.05)], times, q0=q, velocity=v_max)
+    motion = follow(model, goals, times, q0=q, velocity=v_max)
     fine = motion.clip().evaluate(np.linspace(0, times[-1], 2000))
     assert np.abs(np.diff(fine.q, axis=0)).max() <= v_max * times[-1] / 1999 * (1 + 1e-6)
 
@@ -412,6 +412,8 @@ def test_mistakes_are_told():
     model = load_model("arm6")
     with pytest.raises(ModelError, match="evenly spaced"):
         follow(model, lambda t: [JointValue("elbow", 0)], [0, 1, 3])
+    with pytest.raises(ModelError, match="1 lists of goals for 3 instants"):
+        follow(model, [[JointValue("elbow", 0)]], [0, 1, 2])
     with pytest.raises(ModelError, match="velocity must be positive"):
         Follower(model, dt=0.01, velocity=-1)
     with pytest.raises(ModelError, match="end after it starts"):

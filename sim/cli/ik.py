@@ -170,6 +170,5 @@ def _film(model: Any, held: list[Goal], start: Any, q: Any, path: Path) -> Path:
     share = x * x * (3 - 2 * x)
     way = blend(model, np.tile(start, (len(t), 1)), np.tile(q, (len(t), 1)), share)
     if held:
-        near = dict(zip(t.tolist(), way, strict=True))
-        way = follow(model, lambda x: [*held, Posture(near[x], weight=1.0)], t, start=way[0]).q
+        way = follow(model, [[*held, Posture(near, weight=1.0)] for near in way], t, start=way[0]).q
     return film(model, t, way, path)

@@ -33,13 +33,14 @@ from .verdict import Residual, Verdict
 from .wholes import Posture
 
 Array = NDArray[np.float64]
-Goals = Callable[[float], Sequence[Goal]]
+Goals = Callable[[float], Sequence[Goal]] | Sequence[Sequence[Goal]]
 _TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference acceleration
 _REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
 _WISHED = 1e-2  # weight of wishes beside hard goals
 _STARTS = 6
 _ROUNDING = 1e-9  # of a limit
 _WALL = 100.0  # weight of the limit of a ball joint beside that of goals
+_SETTLED = 15  # programmes from a motion that is nearly right
 _LAST, _SMALL = 4, 1e-3  # steps that may still meet goals exactly, and their greatest length [rad or m]
 _TIGHTER = 4  # times that limits are drawn in until rotations keep them
 
@@ -106,16 +107,16 @@ def follow(
     around: ArrayLike | None = None,
     iterations: int = 30,
 ) -> Motion:
-    """Motion of `model` along goals(t) at evenly spaced `times` (k,), smooth over the whole clip.
+    """Motion of `model` along goals at evenly spaced `times` (k,), smooth over the whole clip.
 
+    `goals`: a function of time [s] that gives them, or one list of goals an instant, as from a capture.
     `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
     by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
     `around` (k, nq): motion of the joints that do not move for the goals; default they stay as `q0`.
-    Raises ModelError for times that are not evenly spaced.
+    Raises ModelError for times that are not evenly spaced or goals that do not fit them.
     """
     t = np.asarray(times, dtype=float)
-    if t.ndim != 1 or len(t) < 3 or not np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6) or t[1] <= t[0]:
-        raise ModelError("a track needs at least three evenly spaced, increasing times")
+    evenly(t)
     if around is not None and q0 is None:
         q0 = np.asarray(around, dtype=float)[0]
     v_max, a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
@@ -129,6 +130,24 @@ def follow(
     elif not line.bounded:
         q = _tightened(line, q)
     return _motion(line, q, limits)
+
+
+def evenly(t: Array) -> None:
+    """ModelError when times t (k,) are not at least three, increasing by even steps (to a thousandth)."""
+    if t.ndim != 1 or len(t) < 3 or t[1] <= t[0] or not np.allclose(np.diff(t), t[1] - t[0], rtol=1e-3):
+        raise ModelError("a track needs at least three evenly spaced, increasing times")
+
+
+def near_path(
+    model: mujoco.MjModel, goals: Sequence[Sequence[Goal]], t: Array, q: Array, joints: Sequence[str]
+) -> Array:
+    """Smooth motion (k, nq) along goals, one list an instant t (k,), found from a motion q (k, nq); joints
+    that are not named stay as in it."""
+    evenly(t)
+    line = _Line(model, goals, t, joints, q, bounded=False)
+    free = np.full(model.nv, np.inf)
+    limits = Limits(line.space, float(t[1] - t[0]), free, free, False)
+    return _smoothed(line, line.space.clip(q), limits, _SETTLED)
 
 
 class _Line:
@@ -147,8 +166,11 @@ class _Line:
         self.model, self.t, self.space, self.joints = model, t, Space(model), joints
         self.bounded = bounded
         kinematics = Kinematics(model)
+        rows = [goals(float(x)) for x in t] if callable(goals) else goals
+        if len(rows) != len(t):
+            raise ModelError(f"{len(rows)} lists of goals for {len(t)} instants; give one an instant")
         self.problems = [
-            Problem(model, goals(float(x)), self.space, joints=joints, kinematics=kinematics) for x in t
+            Problem(model, row, self.space, joints=joints, kinematics=kinematics) for row in rows
         ]
         self.moved = np.any([p.moved for p in self.problems], axis=0)
         self.around = None if around is None else np.asarray(around, dtype=float)
