@@ -76,7 +76,7 @@ CASES = [
     (cart, {"limit": 20.0, "slew": 150.0, "reach": 0.3}),
     (cart, {"speed": {"slide": 0.5}, "reach": 0.2, "limit": 1e4}),
     (arm, {"limit": 12.0}),
-    (arm, {"limit": 15.0, "slew": 400.0, "speed": 2.0}),
+    (arm, {"limit": 15.0, "slew": 400.0, "speed": 1.0}),
 ]
 
 
@@ -157,6 +157,20 @@ def test_moves_fill_the_horizon(horizon, period, fine):
     assert sum(lengths) >= ticks > sum(lengths[:-1])
     assert powers == sorted(powers)
     assert powers[:fine] == [0] * min(fine, ticks)
+
+
+def test_moves_of_many_ticks_are_those_ticks():
+    """Held changes of 4 ticks: where they lead and what they cost, tick by tick; past the end of the keys."""
+    law = arm(horizon=2.0)
+    A, B, K, P, _ = law.lqr.solution
+    for i in (0, 7, len(K) - 3):
+        x, c, cost = np.array([0.1, -0.2, 0.3, 0.4]), np.array([1.5, -0.7]), 0.0
+        y = x
+        for j in np.minimum(i + np.arange(4), len(K) - 1):
+            y = A[j] @ y + B[j] @ (c - K[j] @ y)
+            cost += c @ (law.lqr.R + B[j].T @ P[j + 1] @ B[j]) @ c
+        np.testing.assert_allclose(law.ahead.step[2][i] @ x + law.ahead.push[2][i] @ c, y, atol=1e-12)
+        assert c @ law.ahead.weight[2][i] @ c == pytest.approx(cost, rel=1e-9)
 
 
 def closed_loop(law, q, v, seconds, noise=0.0):

@@ -100,6 +100,7 @@ class MPC:
         self.x_high = np.concatenate([np.where(limited, ranges[:, 1], np.inf)[self.moving], top[self.moving]])
         self.limited = np.flatnonzero(np.isfinite(self.x_high - self.x_low))
         self.soft = positive("the MPC's soft", soft) * float(self.lqr.Q.max())
+        self._known: dict[bool, tuple[Array, Array, Array]] = {}
 
     @cached_property
     def ahead(self) -> Doubling:
@@ -190,7 +191,14 @@ class MPC:
 
     def program(self, ahead: Ahead, *, first: bool) -> tuple[Array, Array, Array]:
         """M (r, z) of the rows by scaled changes of the moves, their softness (r,), and the change of the
-        first move by its part of z, (m, m)."""
+        first move by its part of z, (m, m). On keys that rest it is always the same."""
+        if len(self.lqr.solution.K) > 1:
+            return self._program(ahead, first)
+        if first not in self._known:
+            self._known[first] = self._program(ahead, first)
+        return self._known[first]
+
+    def _program(self, ahead: Ahead, first: bool) -> tuple[Array, Array, Array]:
         b, m, n = len(self.powers), len(self.inputs), ahead.x.shape[1]
         K, X, U = self.lqr.solution.K, np.zeros((b + 1, n, b * m)), np.zeros((b, m, b * m))
         for k, (p, i) in enumerate(zip(self.powers, ahead.at, strict=True)):

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from control_figures import Figure, at_least, at_most, info
 from control_fit import PARTS as FIT
+from control_linear import PARTS as LINEAR
 from control_mpc import PARTS as MPC
 from pantograph.controllers.basin import Catch, map_basin, picture
 from pantograph.controllers.design import LinearSystem, dlqr, held, lqr
@@ -79,22 +80,16 @@ def arm_scene(period: float, seed: int) -> Scene:
 
 
 def tracking(console: Console) -> list[Figure]:
-    """Computed torque with an exact model; and which law keeps what with 10 % more mass."""
+    """Computed torque with an exact model."""
     errors, ticks = [], []
     for seed in range(5):
         trial = run_trial(make_plan(arm_scene(1e-3, seed)), "computed-torque", {}, Disturbance())
         errors.append(trial.figures.worst)
         ticks.append(trial.figures.tick)
-    figures = [
+    return [
         at_most("computed torque, exact model, 1 kHz: largest error of 5 clips", max(errors), 1e-6, "rad"),
         info("computed torque: median tick", 1e6 * float(np.median(ticks)), "us"),
     ]
-    plan = make_plan(arm_scene(1e-3, 0))
-    heavy = Disturbance(mass=(1.1,) * plan.problem.model.nbody)
-    for law in ("pd", "pid", "computed-torque", "lqr"):
-        worst = run_trial(plan, law, {}, heavy).figures.worst
-        figures.append(info(f"10 % more mass, {law}: largest error", worst, "rad"))
-    return figures
 
 
 def swing_law(which: str, **words: float) -> tuple[mujoco.MjModel, SwingUp]:
@@ -161,14 +156,22 @@ def basin() -> Figure:
 
 
 def robust(console: Console) -> list[Figure]:
-    """The comparison that `pantograph control` prints, on the arm."""
-    result = compare(arm_scene(2e-3, 1), ["pd", "pid", "computed-torque", "lqr"], trials=8, processes=2)
-    return [
-        info(f"8 disturbed runs, {row.variant.name}: worst RMS", row.robust, "rad") for row in result.rows
-    ]
+    """Which law keeps what: each body's mass wrong by up to 10 %, with pushes of a fifth of the weight."""
+    laws, figures = ["pd", "pid", "computed-torque", "lqr", "mpc"], []
+    for name, mass, push in (("masses wrong by 10 %", 0.1, 0.0), ("and pushed", 0.1, 0.2)):
+        for row in compare(arm_scene(2e-3, 1), laws, trials=8, mass=mass, push=push).rows:
+            law = row.variant.name
+            figures.append(info(f"{name}, {law}: RMS as modelled", row.nominal.rms, "rad"))
+            figures.append(info(f"{name}, {law}: worst RMS of 8", row.robust, "rad"))
+    plan = make_plan(arm_scene(1e-3, 0))
+    heavy = Disturbance(mass=(1.1,) * plan.problem.model.nbody)
+    for law in laws:
+        worst = run_trial(plan, law, {}, heavy).figures.worst
+        figures.append(info(f"all masses 10 % larger, {law}: largest error", worst, "rad"))
+    return figures
 
 
-PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **FIT, **MPC}
+PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **LINEAR, **FIT, **MPC}
 
 
 def main() -> int:

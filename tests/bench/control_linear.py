@@ -1,0 +1,97 @@
+"""The linear predictive part of `make bench NAME=control`: against LQR, and QP by QP against DAQP."""
+
+import time
+
+import casadi as ca
+import numpy as np
+from control_figures import Figure, at_most, info
+from pantograph.controllers.basin import advance
+from pantograph.controllers.lqr import LQR
+from pantograph.controllers.predictive import linear as predictive
+from pantograph.models import load_model
+from pantograph.sim.clip import Clip
+from pantograph.sim.control import Target
+from pantograph.sim.curves import keyed
+from rich.console import Console
+
+PERIOD, SECONDS = 0.01, 4.0
+STILL = Target(np.zeros(2), np.zeros(2), np.zeros(2))
+
+
+def cart(kind: type, limit: float, reach: float, **words: float) -> predictive.MPC | LQR:
+    """A pole to balance on a cart that drives towards the end of its rail."""
+    model = load_model("cart_pole")
+    model.actuator_ctrlrange[0], model.jnt_range[0] = [-limit, limit], [-reach, reach]
+    clip = Clip(model, {"slide": keyed([0], [0.0])}, np.zeros(2))
+    driven, none = np.array([True, False]), np.zeros(2, dtype=bool)
+    return kind(model, driven, np.zeros(2), clip, PERIOD, SECONDS, none, position=100.0, **words)
+
+
+def peer(n: int, M: np.ndarray) -> ca.Function:
+    """DAQP for the same programs, M with its softness as more unknowns."""
+    shape = {"h": ca.Sparsity.diag(n), "a": ca.DM(M).sparsity()}
+    return ca.conic("peer", "daqp", shape)
+
+
+def linear(console: Console) -> list[Figure]:
+    """Without limits in the way LQR to rounding; with them the optimum, in real time."""
+    rng, free = np.random.default_rng(0), [cart(k, 1e6, 1e6) for k in (predictive.MPC, LQR)]
+    apart = 0.0
+    for _ in range(200):
+        q, v = rng.normal(size=2), rng.normal(size=2)
+        (mine, _), (theirs, _) = (law(0.0, q, v, STILL, law.start()) for law in free)
+        apart = max(apart, abs(mine[0] / theirs[0] - 1.0))
+    law, seen, ticks = cart(predictive.MPC, 12.0, 0.4, horizon=1.0), [], []
+    plain, furthest = predictive.least_change, 0.0
+
+    def watched(*arguments, **words):
+        begun = time.thread_time()
+        out = plain(*arguments, **words)
+        seen.append((time.thread_time() - begun, arguments[:4], out[0]))
+        return out
+
+    predictive.least_change = watched
+    try:
+        for _ in range(6):
+            q, v = np.array([rng.uniform(0.2, 0.35), rng.uniform(-0.1, 0.1)]), rng.uniform(0.0, 0.4, 2)
+            memory = law.start()
+            for k in range(round(SECONDS / PERIOD)):
+                begun = time.thread_time()
+                tau, memory = law(k * PERIOD, q, v, STILL, memory)
+                ticks.append(time.thread_time() - begun)
+                tau[1] = 0.1 * rng.normal()  # gusts at the pole
+                q, v = (x[0] for x in advance(law.lqr.nominal, q[None], v[None], tau[None], PERIOD / 4, 4))
+                furthest = max(furthest, abs(q[0]))
+    finally:
+        predictive.least_change = plain
+    error, ratios = _against(seen)
+    late = float(np.percentile(ticks, 99))
+    name = f"linear MPC, 100 Hz, {len(law.powers)} moves over 1 s"
+    return [
+        at_most("linear MPC without limits against LQR, relative", apart, 1e-9, ""),
+        at_most(f"{name}: 99th percentile of a tick, processor time", 1e3 * late, 1e3 * PERIOD, "ms"),
+        info(f"{name}: median tick, processor time", 1e3 * float(np.median(ticks)), "ms"),
+        info(f"{name}: ticks that limits change", len(seen) / len(ticks), ""),
+        info(f"{name}: way of the cart, of its range", furthest / 0.4, ""),
+        at_most(f"{name}: first force against DAQP, of the drive's", error, 1e-6, ""),
+        info(f"{name}: DAQP's time through CasADi / ours, median", float(np.median(ratios)), ""),
+    ]
+
+
+def _against(seen: list) -> tuple[float, list[float]]:
+    """Largest difference of the first unknown, and DAQP's time over ours, for each program."""
+    solver, worst, ratios = None, 0.0, []
+    for seconds, (M, low, high, give), z in seen:
+        soft = np.flatnonzero(give)
+        full = np.hstack([M, np.sqrt(give)[:, None] * np.eye(len(M))[:, soft]])
+        if solver is None or solver.size1_in("x0") != full.shape[1] or solver.size1_in("lba") != len(M):
+            solver = peer(full.shape[1], np.ones_like(full))
+        given = {"h": ca.DM.eye(full.shape[1]), "g": 0, "a": ca.DM(full), "lba": low, "uba": high}
+        begun = time.thread_time()
+        done = solver(**given)
+        ratios.append((time.thread_time() - begun) / seconds)
+        worst = max(worst, abs(float(done["x"][0]) - z[0]) * abs(M[0, 0]) / 12.0)
+    return worst, ratios
+
+
+PARTS = {"linear": linear}
