@@ -15,6 +15,8 @@ from .engines.interface import Array, Drive, Held, Problem, Role
 from .errors import EngineError
 from .kinds import SCALAR
 
+_CHUNK = 1024  # ticks whose targets are evaluated at once
+
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _AFFINE_BIAS = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -54,8 +56,7 @@ class Sampled:
         self.actuators = controlled_actuators(problem.model, problem.drives)
         self.memory = law.start()
         self.nu = problem.model.nu
-        ticks = np.arange(int(np.ceil(problem.duration / period - 1e-9)) + 1) * period
-        self.targets = self.clip.evaluate(ticks)
+        self._first, self._targets = -1, self.clip.evaluate(np.zeros(1))
         self.live = problem.live(period) if problem.live is not None else None
 
     def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
@@ -63,7 +64,7 @@ class Sampled:
 
         Raises EngineError for forces that are not finite; MuJoCo would take them for zero.
         """
-        target = Target(self.targets.q[k], self.targets.v[k], self.targets.a[k])
+        target = self._target(k)
         if self.live is not None:
             target = Target(*self.live.at(t, q, v, target))
         tau, self.memory = self.law(t, q, v, target, self.memory)
@@ -75,6 +76,15 @@ class Sampled:
         ctrl[self.actuators.index] = self.actuators.ctrl_for(qfrc, q, v)
         qfrc[self.actuators.dof] = 0.0
         return Held(ctrl, qfrc)
+
+    def _target(self, k: int) -> Target:
+        """Where the keys are at tick ``k``; evaluated some ticks at a time."""
+        first = k - k % _CHUNK
+        if first != self._first:
+            self._targets = self.clip.evaluate(np.arange(first, first + _CHUNK) * self.period)
+            self._first = first
+        targets, i = self._targets, k - first
+        return Target(targets.q[i], targets.v[i], targets.a[i])
 
 
 class Replay:

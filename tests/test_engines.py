@@ -14,6 +14,7 @@ from oracles.sine import sine
 from pantograph.models import captured_warnings
 from pantograph.sim import Scene, make_plan, run
 from pantograph.sim.clip import Clip
+from pantograph.sim.control import Sampled
 from pantograph.sim.curves import keyed
 from pantograph.sim.engines.contact import ContactEngine
 from pantograph.sim.engines.derive import derive
@@ -471,3 +472,32 @@ def test_roles_split_every_dof_exactly_once():
     masks = [plan.problem.dofs(r) for r in Role]
     assert np.array_equal(np.sum(masks, axis=0), np.ones(plan.problem.model.nv))
     assert len(list(itertools.chain(*(plan.joints(r) for r in Role)))) == plan.problem.model.njnt
+
+
+def test_a_long_scene_begins_at_once():
+    """The targets of a controller are those of the keys at every tick, and not all worked out at once."""
+    scene = Scene(
+        duration=1e7,
+        models=[{"file": "pendulum"}],
+        roles={"tracked": ["hinge"]},
+        keys=[{"joint": "hinge", "times": [0, 1, 2.5], "values": [0, 1, 0], "after": "loop"}],
+        controller={"law": "pd", "period": 0.002},
+    )
+    plan = make_plan(scene)
+    seen = []
+
+    class Law:
+        def start(self):
+            return None
+
+        def __call__(self, t, q, v, target, memory):
+            seen.append(target)
+            return np.zeros(1), None
+
+    sampled = Sampled(Law(), plan.problem, 0.002)
+    ticks = [0, 1, 1023, 1024, 1025, 5000, 3, 4_999_999_999]
+    for k in ticks:
+        sampled.sample(k, 0.002 * k, np.zeros(1), np.zeros(1))
+    expected = plan.problem.clip.evaluate(0.002 * np.array(ticks))
+    for i, name in enumerate(("q", "v", "a")):
+        np.testing.assert_array_equal([target[i] for target in seen], getattr(expected, name))
