@@ -298,7 +298,11 @@ def _step(setup: Setup, engine: str, period: float | None) -> tuple[float, Choic
         why = "the model file says so" if _same(h, own) else f"the model's {own:g} s fitted to the duration"
     if not _whole(duration / h):
         why += f"; the run ends after whole steps, at {round(duration / h) * h:.6g} s"
-    return (own if _same(h, own) else h), Choice(f"{h:.6g} s", why)
+    h = own if _same(h, own) else h
+    if setup.scene.solver.tolerance is not None:
+        why = "the tolerance decides; keys that bend, samples of the controller and limits end steps"
+        return h, Choice("of any length", f"{why}; records lie on a grid of {h:.6g} s")
+    return h, Choice(f"{h:.6g} s", why)
 
 
 def _same(h1: float, h2: float) -> bool:

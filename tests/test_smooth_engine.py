@@ -17,6 +17,7 @@ from pantograph.sim.engines.contact import ContactEngine
 from pantograph.sim.engines.interface import Problem, Role, State
 from pantograph.sim.engines.limits import complementary
 from pantograph.sim.engines.smooth import SmoothEngine
+from pantograph.sim.errors import SceneError
 from scipy.integrate import solve_ivp
 
 G = 9.81
@@ -633,3 +634,12 @@ def test_impacts_on_joints_that_rest_on_limits_of_their_own(tmp_path, n, limit, 
         assert np.abs(r.q).max() <= limit + 1e-12
         assert np.diff(r.energy).max() < 1e-9
         assert r.energy[-1] < r.energy[0] - 1.0
+
+
+def test_a_plan_by_tolerance_promises_no_step():
+    plan = make_plan(Scene(duration=0.5, models=[{"file": "pendulum"}], solver={"tolerance": 1e-8}))
+    assert plan.step.what == "of any length" and "0.002 s" in plan.step.why
+    with pytest.raises(
+        SceneError, match="steps at a fixed rate, and not the smooth one, since bodies can touch"
+    ):
+        make_plan(Scene(duration=0.5, models=[{"file": "quadruped"}], solver={"tolerance": 1e-8}))

@@ -111,9 +111,8 @@ def plan(console: Console, plan: Plan) -> None:
     table.add_row("integrator", f"{plan.integrator.what}: {plan.integrator.why}")
     table.add_row("step", f"{plan.step.what}: {plan.step.why}")
     steps = 0 if plan.engine.what == "kinematic" else plan.problem.steps
-    table.add_row(
-        "work", f"{steps} steps, a sample every {plan.problem.sample_every * plan.problem.step:.4g} s"
-    )
+    count = f"{steps} steps" if plan.problem.tolerance is None else "as many steps as the tolerance takes"
+    table.add_row("work", f"{count}, a sample every {plan.problem.sample_every * plan.problem.step:.4g} s")
     if plan.period is not None:
         item = plan.setup.scene.controller
         table.add_row("controller", f"{item.law if item else 'pd'}, every {plan.period:g} s, held in between")
