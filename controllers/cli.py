@@ -91,7 +91,7 @@ def _tables(result: Any) -> tuple[Table, Table]:
     """How well each law follows, and what it takes."""
     count = len(result.disturbances)
     well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
-    well.title = f"errors over the tracked joints (rad, m), settling (s); the worst of {count} disturbed runs"
+    well.title = f"tracked joints: errors (rad, m), settling (s); worst of {count} disturbed runs"
     cost = _columns("law", "effort", "work J", "saturated", "tick us", "99 % us", "of period")
     cost.title = f"what it takes; period {result.period * 1e3:g} ms"
     for row in result.rows:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+_TASK_WORDS = ("goal", "site", "axes")  # parameters that say what to do, not how
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ def compare(
     forces of up to ``push`` of what its drives can give (or of its weight, of ideal drives) for a tenth of
     the scene. ``sweep`` gives lists of parameter values: for every law, each combination of those that it
     has is a variant. The scene's own
-    controller parameters go to its own law, those of sensors and drives to all. Undisturbed runs are timed
+    controller parameters go to its own law, to the others those that say what to do (a goal, a site) and
+    those of sensors and drives. Undisturbed runs are timed
     one after the other, those of a sweep and disturbed ones share the processors.
     Raises SceneError for laws and parameters that do not fit.
     """
@@ -164,13 +166,13 @@ def _plan(scene: Scene) -> Plan:
 
 def _variants(scene: Scene, laws: Sequence[str], sweep: Mapping[str, Sequence[Any]]) -> list[Variant]:
     own = scene.controller.parameters if scene.controller else {}
-    shared = {word: value for word, value in own.items() if word in LOOP_WORDS}
     out: list[Variant] = []
     for word in sweep:
         if not any(word in known_words(law) for law in laws):
             check_law(laws[0], {word: None})
     for law in laws:
-        base = own if scene.controller and law == scene.controller.law else shared
+        told = {w: own[w] for w in own if w in LOOP_WORDS or (w in _TASK_WORDS and w in known_words(law))}
+        base = own if scene.controller and law == scene.controller.law else told
         known = {word: values for word, values in sweep.items() if word in known_words(law)}
         for values in product(*known.values()):
             chosen = dict(zip(known, values, strict=True))

@@ -241,6 +241,23 @@ def test_sensors_of_the_scene_are_for_all_laws_and_its_gains_for_its_own():
     assert result.rows[1].nominal.rms > 3 * exact.rows[0].nominal.rms
 
 
+def test_what_to_do_is_for_all_laws_that_can():
+    scene = Scene(
+        duration=2.0,
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        keys=[{"joint": "slide", "times": [0], "values": [0]}],
+        initial={"position": {"hinge": 0.1}},
+        controller={"law": "lqr", "period": 0.01, "goal": {"hinge": 0.0}, "position": 100.0},
+    )
+    result = compare(scene, ["pd", "lqr", "mpc"], processes=1)
+    pd, lqr, mpc = (row.variant.words for row in result.rows)
+    assert pd == {}
+    assert lqr == {"goal": {"hinge": 0.0}, "position": 100.0}
+    assert mpc == {"goal": {"hinge": 0.0}}
+    assert all(np.abs(result.trials[law].error[-1]).max() < 0.05 for law in ("lqr", "mpc"))
+
+
 def test_a_scene_without_anything_to_control_is_refused():
     scene = Scene(duration=1.0, models=[{"file": "pendulum"}])
     with pytest.raises(PantographError, match="nothing to control"):
