@@ -7,8 +7,8 @@
 
 e, k are weighted residuals of goals to meet and of wishes, w the way from q0. The first is the second
 without wishes and with w = 0, so that both are one program. P holds freedoms at their limits: those that
--J^T e pushes outward, or those named by `hold`. With fewer freedoms than rows the first comes from the
-freedoms' side, and there is no second.
+-J^T e pushes outward, or those named by `hold`, which also names rows at the edge of their room. With fewer
+freedoms than rows the first comes from the freedoms' side, and there is no second.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Layout(NamedTuple):
     @property
     def holds(self) -> int:
         """Number of limits that can hold."""
-        return len(self.scalars) + len(self.balls)
+        return len(self.scalars) + len(self.balls) + len(self.banded)
 
 
 def layout(problem: Problem) -> Layout:
@@ -177,7 +177,7 @@ def iteration_tape(problem: Problem, at: Layout) -> Tape:
 
     next: q after the step d, or a share of it; cost, worst, value at q: e.e, the largest residual over its
     tolerance, k.k + s w.w; longest: entry of d. For the way along the goals what the next call wants: held,
-    limits that hold from then on (scalars, then balls; 1 or 0), the share taken with d.d, and d.
+    limits that hold from then on (scalars, balls, rows with room; 1 or 0), the share taken with d.d, and d.
     """
     graph, nq = Graph(), problem.space.nq
     q, mu, hold = graph.inputs("q", nq), graph.inputs("mu", 1), graph.inputs("hold", at.holds)
@@ -187,7 +187,8 @@ def iteration_tape(problem: Problem, at: Layout) -> Tape:
     worst: Scalar = 0.0
     for i, inverse in given.share.items():
         worst = maximum(worst, absolute(rows[i].r) * inverse)
-    e, J = _weighted(rows, given.hard)
+    edges = dict(zip(map(int, at.banded), hold[at.holds - len(at.banded) :], strict=True))
+    e, J = _weighted(rows, given.hard, edges, given.pull)
     cost = total(x * x for x in e)
     gradient = {v: total(x * row[v] for x, row in zip(e, J, strict=True) if v in row) for v in _columns(J)}
     way: dict[int, Scalar] = {}
@@ -210,7 +211,8 @@ def iteration_tape(problem: Problem, at: Layout) -> Tape:
     if at.along or len(e) <= len(gradient):
         y = _multipliers([*e, *k], B, holds.project(way), [damping] * len(e) + [damping + given.s] * len(k))
         full = _along(holds.project(way), B, y)
-        held = holds.following(_along(way, raw, y)) if at.along else held
+        if at.along:
+            held = holds.following(_along(way, raw, y)) + _edges(rows, given.hard, edges, y)
     else:
         full = _by_freedoms(e, B, list(gradient), damping)
     longest: Scalar = 0.0
@@ -239,20 +241,41 @@ def _share(past: Sequence[Node], inner: Scalar, pull: Scalar) -> Scalar:
     return 1.0 + curved * (clip(ratio, *_SHARES) - 1.0)
 
 
-def _weighted(rows: list[Row], given: _Weights) -> tuple[list[Scalar], list[dict[int, Scalar]]]:
-    """Residuals and Jacobian as the solver sees them (`Problem.weighted`)."""
+def _weighted(
+    rows: list[Row], given: _Weights, edges: dict[int, Node] | None = None, pull: Scalar = 0.0
+) -> tuple[list[Scalar], list[dict[int, Scalar]]]:
+    """Residuals and Jacobian as the solver sees them (`Problem.weighted`).
+
+    Rows with room count beyond it; on the way along the goals where `edges` says, and from the edge.
+    """
     e: list[Scalar] = []
     J: list[dict[int, Scalar]] = []
     for i, w in given.weight.items():
         x: Scalar = rows[i].r
         live: Scalar = w
         if i in given.band:
-            band = given.band[i]
-            x = x - minimum(maximum(x, -band), band)
-            live = w * less(band, absolute(rows[i].r))
+            band, outside = given.band[i], less(given.band[i], absolute(x))
+            beyond = x - minimum(maximum(x, -band), band)
+            edge = pull * edges[i] if edges is not None and i in edges else 0.0
+            x = (1.0 - pull) * beyond + edge * (x - _side(x) * band)
+            live = w * ((1.0 - pull) * outside + edge)
         e.append(w * x)
         J.append({v: live * y for v, y in rows[i].J.items() if isinstance(y, Node) or y != 0.0})
     return e, J
+
+
+def _side(r: Scalar) -> Scalar:
+    return 1.0 - 2.0 * less(r, 0.0)
+
+
+def _edges(rows: list[Row], given: _Weights, edges: dict[int, Node], y: list[Scalar]) -> list[Scalar]:
+    """Which rows are at the edge of their room from now on: those beyond it, and those pushed against it."""
+    out: list[Scalar] = []
+    for i, multiplier in zip(given.weight, y, strict=False):
+        if i in edges:
+            pushed = 1.0 - less(multiplier * _side(rows[i].r), 0.0)
+            out.append(maximum(edges[i] * pushed, less(given.band[i], absolute(rows[i].r))))
+    return out
 
 
 def _columns(J: list[dict[int, Scalar]]) -> list[int]:
@@ -264,7 +287,7 @@ class _Holds:
 
     def __init__(self, problem: Problem, q: Sequence[Node], at: Layout, given: _Split, hold: Sequence[Node]):
         self.problem, self.q, self.at, self.given = problem, q, at, given
-        self.named = dict(zip([*map(int, at.scalars), *(b.v for b in at.balls)], hold, strict=True))
+        self.named = dict(zip([*map(int, at.scalars), *(b.v for b in at.balls)], hold, strict=False))
         self.free: dict[int, Scalar] = {}
         self.axes: dict[int, list[Scalar]] = {}  # outward, of balls at their limits
         self.lost: dict[int, list[Scalar]] = {}  # the same, zero where nothing is held

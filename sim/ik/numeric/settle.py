@@ -90,7 +90,7 @@ def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: 
     machine = quick.machine
     first = worth(problem, q, start, faint)
     far = machine.settle(q, machine.arguments(problem, q0=start, s=faint**2))
-    rest = (far.step < _REST / faint) & (far.worst < 1e-2)
+    rest = (far.step < _REST / faint) & (far.worst <= 1.0)
     fine = rest & (far.value <= first * 1.001 + 1e-6)  # q may meet its goals by their tolerances alone
     x, value = far.q, far.value
     if (far.worst[fine] > 1e-6).any():  # wishes that pull hard leave the goals open by rounding
