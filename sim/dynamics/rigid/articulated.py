@@ -35,9 +35,7 @@ def articulated_solve(
         inertia, load = blocks[index], loads[index]
         if link.dadr not in skip:
             for dof, axis in reversed(_axes(link)):
-                inertia, load, step = _eliminate(
-                    inertia, load, dof, axis, b[dof], fields.armature(dof)
-                )
+                inertia, load, step = _eliminate(inertia, load, dof, axis, b[dof], fields.armature(dof))
                 removed[index].append(step)
         if link.parent >= 0:
             _hand_over(at, inertia, load, blocks[link.parent], loads[link.parent])
