@@ -1,6 +1,7 @@
 """Fitted motion obeys the machine: known optima, limits, passive joints, hard keys, and simulation."""
 
 import re
+import signal
 from pathlib import Path
 
 import mujoco
@@ -299,11 +300,33 @@ def test_a_scene_says_machine_and_contacts(tmp_path):
     assert "certificate to 0.001 holds" in done.output
     assert (tmp_path / "sway.gif").exists()
     assert np.abs(load(tmp_path / "sway.fit.npz").v[:, 0]).max() <= 1.4 * (1 + 1e-3)
-    done = run.invoke(app, [str(scene), "--out", str(tmp_path), "--how", "check", "--velocity", "5"])
-    assert re.search(r"elbow +velocity +0 +5 ", done.output)
+    done = run.invoke(app, [str(scene), "--out", str(tmp_path), "--how", "check", "--velocity", "2"])
+    assert re.search(r"shoulder +velocity +1\.125 +2 +56\.2%", done.output)
     scene.write_text(scene.read_text() + '[[fit.phases]]\nsites = ["tipp"]\nstart = 0\nstop = 0.2\n')
     with pytest.raises(PantographError, match="no site 'tipp'"):
         run.invoke(app, [str(scene)], catch_exceptions=False)
+
+
+def test_ctrl_c_ends_a_fit():
+    seen = []
+
+    def press(text):
+        seen.append(text)
+        if text.endswith("iteration 3"):
+            signal.raise_signal(signal.SIGINT)
+
+    clip = move(ARM, "shoulder", [0, 1.0], [-1.0, 0.5], elbow=[0.5, 1.5])
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        fit(clip, machine(ARM, force=60.0), progress=press)
+    assert len(seen) <= 4
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_keyed_joints_keep_the_limits_of_their_actuators():
+    """The plan of a run leaves out actuators of joints that move as keyed; their machine has them."""
+    scene = load_scene(Path(__file__).parents[1] / "models" / "scenes" / "waving_arm.toml")
+    assert task_of(scene).machine.force_high[0] == 160.0
 
 
 def test_the_jump_as_drawn_needs_what_nothing_gives():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from .contact import Phase
 from .fitted import Certificate, Fitted
 from .machine import Machine
 from .transcription import Point, Transcription, Wish, grid
+from .watch import interruptible, watch
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -65,11 +67,11 @@ def fit(
     wish = Wish(clip, tuple(hard), tuple(phases), effort, deviation, at_rest)
     nodes, margin, found, before = grid(wish, step), 1.0, None, None
     for round_ in range(refine + 1):
-        if progress is not None:
-            missed = "" if found is None else f", missed {found.certificate.by_piece.max():.3g} tolerances"
-            progress(f"grid {round_ + 1} of {refine + 1} at most, {len(nodes) - 1} pieces{missed}")
+        missed = "" if found is None else f", missed {found.certificate.by_piece.max():.3g} tolerances"
+        words = f"grid {round_ + 1} of {refine + 1} at most, {len(nodes) - 1} pieces{missed}"
+        each = None if progress is None else partial(_tell, progress, words)
         problem = Transcription(wish, _drawn_in(machine, margin), nodes)
-        found, before = _solve(problem, machine, tolerance, most, before)
+        found, before = _solve(problem, machine, tolerance, most, before, each)
         certificate = found.certificate
         if certificate.holds:
             break
@@ -78,6 +80,10 @@ def fit(
         nodes = _refined(nodes, certificate.by_piece)
     assert found is not None
     return found
+
+
+def _tell(progress: Progress, words: str, iteration: int) -> None:
+    progress(f"{words}, iteration {iteration}")
 
 
 def _drawn_in(machine: Machine, margin: float) -> Machine:
@@ -99,7 +105,12 @@ def _refined(nodes: Array, missed: Array) -> Array:
 
 
 def _solve(
-    problem: Transcription, true: Machine, tolerance: float, most: int, before: tuple[Array, Point] | None
+    problem: Transcription,
+    true: Machine,
+    tolerance: float,
+    most: int,
+    before: tuple[Array, Point] | None,
+    each: Callable[[int], None] | None,
 ) -> tuple[Fitted, tuple[Array, Point]]:
     """Solve from the keys or from what was found ``before``, and certify against the ``true`` machine."""
     import casadi as ca
@@ -111,18 +122,14 @@ def _solve(
     count = int(program.g.numel())
     lower = np.concatenate([np.zeros(program.equal), np.full(count - program.equal, -np.inf)])
     begun = time.perf_counter()
-    solver = ca.nlpsol(
-        "fit",
-        "ipopt",
-        {"x": program.x, "f": program.cost, "g": program.g},
-        _options(most, before is not None),
-    )
+    guard = watch(int(program.x.numel()), count, each)
+    options = _options(most, before is not None) | {"iteration_callback": guard}
+    solver = ca.nlpsol("fit", "ipopt", {"x": program.x, "f": program.cost, "g": program.g}, options)
     start = problem.guess() if before is None else _between(problem, *before)
-    done = solver(x0=problem.pack(start), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(count))
+    with interruptible(guard):
+        done = solver(x0=problem.pack(start), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(count))
     seconds, stats = time.perf_counter() - begun, solver.stats()
     words = str(stats["return_status"]).replace("_", " ").lower()
-    if words == "user requested stop":
-        raise KeyboardInterrupt
     left = np.asarray(done["g"]).ravel()
     rest = float(max(np.abs(left[: program.equal]).max(initial=0.0), left[program.equal :].max(initial=0.0)))
     if not rest <= 1e-5:

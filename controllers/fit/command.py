@@ -123,19 +123,25 @@ def _table(report: Any, title: str) -> Table:
     """Every limit of the machine, the worst first; ranges and missing forces where they are crossed."""
     verdict = "possible" if report.possible else "impossible"
     table = Table(title=f"{title}: {verdict}", title_justify="left", box=SIMPLE, pad_edge=False)
-    for head in ("joint", "what", "largest", "limit", "in use", "at s", "crossed, s"):
+    for head in ("joint", "what", "largest", "limit", "in use", "at s", "crossed"):
         right = head not in ("joint", "what")
         table.add_column(head, justify="right" if right else "left", no_wrap=True)
+    little = 0
     for use in report.uses:
         crossed = use.share > 1.0 + 1e-6
         value, limit, share = f"{use.value:.4g}", f"{use.limit:.4g}", f"{use.share:.1%}"
+        kind = "no drive" if use.kind == "missing force" else use.kind
         if use.kind in ("position", "missing force"):
-            if not crossed:
-                continue
-            limit, share = ("no drive", "") if use.kind == "missing force" else ("range", "beyond")
-        ends = f"{use.start:.3f} to {use.stop:.3f}" if crossed else ""
-        row = (escape(use.who), use.kind, value, limit, share, f"{use.t:.3f}", ends)
+            limit, share = ("range", "beyond") if use.kind == "position" else ("0", "")
+        if not crossed and (use.share < 0.01 or use.kind in ("position", "missing force")):
+            little += use.kind != "missing force"
+            continue
+        ends = f"{use.start:.2f}-{use.stop:.2f}" if crossed else ""
+        row = (escape(use.who), kind, value, limit, share, f"{use.t:.3f}", ends)
         table.add_row(*row, style="red" if crossed else "")
+    if little:
+        table.caption = f"and {little} limits that hold, ranges or less than 1 % in use"
+        table.caption_justify = "left"
     return table
 
 

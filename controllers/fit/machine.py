@@ -61,8 +61,8 @@ def machine(
 ) -> Machine:
     """The machine of a model: ranges and forces as its file says, the rest as given (None: no limit).
 
-    A limit is one number, or one a joint by name (other joints have none); ``force`` replaces the file's.
-    Raises PantographError for negative limits and names of no joint.
+    A limit is one number for all that is ``driven``, or one a joint by name (other joints have none);
+    ``force`` replaces the file's. Raises PantographError for negative limits and names of no joint.
     """
     low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in np.flatnonzero(model.jnt_limited):
@@ -72,22 +72,28 @@ def machine(
     if force is not None:
         force_high = _limit(model, "force", force)
         force_low = -force_high
+    driven = np.ones(model.nv, dtype=bool) if driven is None else np.asarray(driven, dtype=bool)
     if not current > 0:
         raise PantographError(f"the battery's current must be positive, got {current!r}")
     return Machine(
         Nominal(model),
         low,
         high,
-        _limit(model, "velocity", velocity),
-        _limit(model, "acceleration", acceleration),
-        _limit(model, "jerk", jerk),
+        _moving(model, "velocity", velocity, driven),
+        _moving(model, "acceleration", acceleration, driven),
+        _moving(model, "jerk", jerk, driven),
         force_low,
         force_high,
         _limit(model, "top_speed", top_speed),
         np.zeros(model.nv) if ampere is None else per_joint(model, "ampere", ampere),
         float(current),
-        np.ones(model.nv, dtype=bool) if driven is None else np.asarray(driven, dtype=bool),
+        driven,
     )
+
+
+def _moving(model: mujoco.MjModel, what: str, value: Limit, driven: NDArray[np.bool_]) -> Array:
+    limit = _limit(model, what, value)
+    return limit if isinstance(value, Mapping) else np.where(driven, limit, np.inf)
 
 
 def _limit(model: mujoco.MjModel, what: str, value: Limit) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...sim.clip import Clip, Motion
 from ...sim.errors import PantographError
 from .machine import Machine
+from .watch import interruptible, watch
 
 Array = NDArray[np.float64]
 Rows = Callable[[Motion], tuple[Array, Array, Array, Array]]
@@ -147,14 +148,17 @@ def fastest(along: Path, machine: Machine, rows: Rows, *, ends: tuple[float, flo
     }
     ipopt |= {"acceptable_obj_change_tol": 1e-6, "acceptable_constr_viol_tol": 1e-8}
     options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": ipopt}
+    guard = watch(int(z.numel()), int(g.numel()))
+    options["iteration_callback"] = guard
     solver = ca.nlpsol("timing", "ipopt", {"x": z, "f": ca.sum1(dt), "g": g}, options)
     for slack in (2.0, 6.0, 1.3):
         guess = _guess(along, machine, speed, ends, slack)
-        done = solver(x0=np.clip(guess, low, high), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(len(lower)))
+        with interruptible(guard):
+            done = solver(
+                x0=np.clip(guess, low, high), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(len(lower))
+            )
         words, left = str(solver.stats()["return_status"]), np.asarray(done["g"]).ravel()
         rest = max(np.abs(left[: 3 * n]).max(), left[3 * n :].max(initial=0.0))
-        if words == "User_Requested_Stop":
-            raise KeyboardInterrupt
         if rest <= 1e-5:
             break
     else:

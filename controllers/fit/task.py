@@ -40,9 +40,7 @@ def task_of(scene: Scene, **given: Any) -> Task:
     """
     item = scene.fit or FitItem()
     said = {**dict(item), **{word: value for word, value in given.items() if value}}
-    plan = make_plan(scene)
-    if item.phases:
-        plan = make_plan(_touching(plan))
+    plan = make_plan(_tracked(make_plan(scene)))
     model = plan.problem.model
     able = machine(
         model,
@@ -55,8 +53,8 @@ def task_of(scene: Scene, **given: Any) -> Task:
     return Task(plan, plan.problem.clip, able, tuple(said["hard"]), phases, words)
 
 
-def _touching(plan: Plan) -> Scene:
-    """The scene with its joints tracked: between parts that are all keyed a plan leaves contacts out."""
+def _tracked(plan: Plan) -> Scene:
+    """The scene with its joints tracked: for keyed ones a plan leaves out actuators, and contacts."""
     model, scene = plan.problem.model, plan.setup.scene
     names = names_of(model, "joint")
     mine = [n for n in plan.problem.clip.tracks if int(model.jnt_type[names.index(n)]) != FREE]
