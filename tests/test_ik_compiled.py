@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from oracles import ik_cases, ik_loops, ik_planar
 from pantograph.models import ModelError, load_model
+from pantograph.sim import rotations
 from pantograph.sim.ik import (
     CenterOfMass,
     Distance,
@@ -231,26 +232,52 @@ def test_settling_among_wishes_and_ball_limits_is_that_of_numpy(seed):
         assert quick.value <= settle(problem, slow, wish).value * (1 + 1e-6) + 1e-9
 
 
-def test_settling_comes_to_rest_where_plain_steps_would_not(plain):
-    """Far from the start the goals' curvature counts: a puppet's limbs from all over; and balls at limits."""
-    rng = np.random.default_rng(0)
-    for problem, least in ((_puppet_problem(rng), 0.9), (_limited_tree(rng), 0.7)):
-        if least < 0.9:
-            problem = problem.only(problem.goals[1:])
-        q0 = problem.space.check(problem.model.qpos0)
-        machine = machine_of(problem)
-        ends = machine.descend(
-            problem.space.random(rng, 24, q0, problem.moved),
-            machine.arguments(problem), iterations=100, first=False,
-        )  # fmt: skip
-        met = ends.q[ends.worst <= 1]
-        far = machine.settle(met, machine.arguments(problem, q0=q0))
+def _ends(problem, rng, q0):
+    """Configurations that meet the goals, from all over."""
+    machine = machine_of(problem)
+    starts = problem.space.random(rng, 24, q0, problem.moved)
+    ends = machine.descend(starts, machine.arguments(problem), iterations=100, first=False)
+    return machine, ends.q[ends.worst <= 1]
+
+
+def test_settling_comes_to_rest_far_from_the_start(plain):
+    """There the goals' curvature counts, and Gauss-Newton's whole steps would go on for ever."""
+    rng, model = np.random.default_rng(0), load_model("puppet")
+    space, data = Space(model), mujoco.MjData(model)
+    data.qpos[:] = space.step(model.qpos0[None], 0.3 * rng.normal(size=(1, model.nv)))[0]
+    mujoco.mj_forward(model, data)
+    limbs = [f"{side}_{limb}" for side in ("left", "right") for limb in ("hand", "foot")]
+    goals = [Position(limb, data.site(limb).xpos.copy()) for limb in limbs]
+    exact = Problem(model, [*goals, CenterOfMass(data.subtree_com[0].copy())], space)
+    for problem in (exact, _puppet_problem(np.random.default_rng(0))):  # the latter with room
+        q0 = space.check(model.qpos0)
+        machine, met = _ends(problem, rng, q0)
         assert len(met) > 5
-        assert ((far.step < 1e-9) & (far.worst <= 1)).mean() > least
-        wish = preference("near", problem, q0)
-        value = np.sum(wish(met).r ** 2, axis=1)
+        far = machine.settle(met, machine.arguments(problem, q0=q0))
+        assert ((far.step < 1e-9) & (far.worst <= 1)).mean() > 0.9
+        value = np.sum(preference("near", problem, q0)(met).r ** 2, axis=1)
         np.testing.assert_allclose(worth(problem, met, q0, 1.0), value, rtol=1e-9)
         np.testing.assert_allclose(worth(problem, met, q0, 1e-4), 1e-8 * value, rtol=1e-9)
+
+
+def test_settling_comes_to_rest_at_the_limits_of_balls(plain):
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(6):
+        problem = _limited_tree(rng)
+        problem = problem.only(problem.goals[:1])
+        space = problem.space
+        q0 = space.random(rng, 1, problem.model.qpos0, problem.moved)[0]
+        machine, met = _ends(problem, rng, q0)
+        far = machine.settle(met, machine.arguments(problem, q0=q0))
+        rest = (far.step < 1e-9) & (far.worst <= 1)
+        assert rest.mean() > 0.9
+        angles = np.linalg.norm(rotations.log(far.q[rest][:, space.quats]), axis=-1)
+        assert (angles <= space.cones + 1e-12).all()
+        held += int((angles > space.cones - 1e-9).sum())
+        slow = settle(problem, met[0], preference("near", problem, q0))
+        if rest[0]:
+            assert far.value[0] <= slow.value * (1 + 1e-6) + 1e-9
+    assert held > 20
 
 
 def _questions():
