@@ -12,7 +12,7 @@ from pantograph.sim.curves import keyed
 from pantograph.sim.dynamics import LinearFeedback, compile_model, joint_pd, unsupported
 from pantograph.sim.dynamics.functions import FORMULATIONS, FUNCTIONS
 from pantograph.sim.dynamics.layout import Layout, keyed_joints
-from pantograph.sim.dynamics.prescribed import pieces_of
+from pantograph.sim.dynamics.motion.prescribed import pieces_of
 from pantograph.sim.dynamics.symbolic import Equations
 from pantograph.sim.errors import EngineError
 from pantograph.sim.integrate import TABLEAUS, solve

@@ -2,10 +2,10 @@
 
 from .laws import LinearFeedback, joint_pd
 from .machine import Stats
-from .path import STATUS, Path
+from .motion.path import STATUS, Path
+from .motion.stepper import Stepper
 from .sensitivity import Derivatives, StepDerivatives
 from .smooth import Inputs, Smooth, compile_model
-from .stepper import Stepper
 from .support import differences, unsupported
 
 __all__ = [

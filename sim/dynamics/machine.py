@@ -18,8 +18,8 @@ from .fields import Parameter, parameter_index
 from .fingerprint import code_fingerprint, model_fingerprint
 from .functions import FUNCTIONS, cheaper_formulation
 from .layout import Layout
-from .loops import PARALLEL_OPERATIONS, Loop
-from .rows import NO_MOTION, Rows
+from .motion.loops import PARALLEL_OPERATIONS, Loop
+from .motion.rows import NO_MOTION, Rows
 from .support import differences
 from .symbolic import Equations
 

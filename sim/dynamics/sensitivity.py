@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..integrate.tableau import Tableau
-from .fixed import stage_times
 from .layout import Layout
+from .motion.fixed import stage_times
+from .motion.rows import Prescribed, prescribed_rows
 from .rigid.tree import BALL, FREE
-from .rows import Prescribed, prescribed_rows
 
 if TYPE_CHECKING:
-    from .rows import Start
+    from .motion.rows import Start
     from .smooth import Smooth
 
 Array = NDArray[np.float64]

@@ -22,16 +22,16 @@ from ..compile.cache import Cache, default_folder
 from ..errors import EngineError
 from ..integrate.tableau import Tableau
 from ..integrate.tableaus import DOPRI5, RK4
-from .adaptive import Spans, adaptive
 from .fields import Parameter, parameter_index
-from .fixed import fixed
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
 from .machine import Machine
-from .path import Path
-from .prescribed import constant
+from .motion.adaptive import Spans, adaptive
+from .motion.fixed import fixed
+from .motion.path import Path
+from .motion.prescribed import constant
+from .motion.rows import Controls, Prescribed, PythonLaw, initial_states
 from .problem import SmoothProblem
-from .rows import Controls, Prescribed, PythonLaw, initial_states
 from .sensitivity import Derivatives, StepDerivatives, step_derivatives
 from .support import unsupported
 

@@ -12,8 +12,8 @@ from .limits import Limit, Limits, slack
 from .timed import Timed
 
 if TYPE_CHECKING:
-    from ..dynamics.loops import Guards
-    from ..dynamics.prescribed import Pieces
+    from ..dynamics.motion.loops import Guards
+    from ..dynamics.motion.prescribed import Pieces
     from ..integrate import Tableau
 
 CHUNK = 512  # steps computed in one call at most, and steps whose prescribed motion is evaluated at once
@@ -32,8 +32,8 @@ class Compiled:
         width: float | None,
         resting: tuple[Limit, ...],
     ) -> None:
+        from ..dynamics.motion.stepper import Stepper
         from ..dynamics.smooth import compile_model
-        from ..dynamics.stepper import Stepper
 
         keyed = np.flatnonzero(problem.roles == Role.KEYED).tolist()
         self.timed, self.t0, self.h, self.resting = timed, t0, problem.step, resting
@@ -103,14 +103,14 @@ class Compiled:
 
     def polynomials(self, end: float) -> Pieces:
         """The prescribed motion as polynomials in time since the run's start, up to ``end``."""
-        from ..dynamics.adaptive import motion_of
+        from ..dynamics.motion.adaptive import motion_of
 
         breaks = self.timed.breaks(self.t0, self.t0 + end) - self.t0
         return motion_of(self.smooth, self.at if self.nw else None, 0.0, end, breaks)
 
     def guards(self, limits: Limits) -> Guards | None:
         """What steps of any length must not pass unseen: limits of free joints, the pull of those at rest."""
-        from ..dynamics.loops import Guards
+        from ..dynamics.motion.loops import Guards
 
         free = self._free(limits)
         gaps = [(limit, self.q_free == limit.qpos, self.v_free == limit.dof) for limit in free]

@@ -13,7 +13,7 @@ from .interface import Array, Controls, Problem
 from .smooth_run import Run
 
 if TYPE_CHECKING:
-    from ..dynamics.adaptive import Follower
+    from ..dynamics.motion.adaptive import Follower
     from ..integrate import Tableau
 
 MOST = 1000
@@ -96,7 +96,7 @@ class AdaptiveRun(Run):
 
     def _follower(self) -> Follower:
         """The compiled integration with the joints at rest taken out."""
-        from ..dynamics.adaptive import Follower
+        from ..dynamics.motion.adaptive import Follower
 
         c = self.model()
         if id(c) not in self.followers:

@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compile.cache import key_of
-from ..compile.kernels import kernel
-from ..compile.llvm import declarations
-from ..compile.loops import declare
-from ..compile.program import Code, facts_of, obtain
-from ..compile.rollout import Shape, live_stages
-from ..compile.tape import Tape
-from ..integrate.tableau import Tableau
-from .laws import LinearFeedback
+from ...compile.cache import key_of
+from ...compile.kernels import kernel
+from ...compile.llvm import declarations
+from ...compile.loops import declare
+from ...compile.program import Code, facts_of, obtain
+from ...compile.rollout import Shape, live_stages
+from ...compile.tape import Tape
+from ...integrate.tableau import Tableau
+from ..laws import LinearFeedback
 from .path import STATUS, Path
 from .rows import Start
 
 if TYPE_CHECKING:
-    from .smooth import Smooth
+    from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compile.program import address
-from ..errors import EngineError
-from .laws import LinearFeedback
+from ...compile.program import address
+from ...errors import EngineError
+from ..laws import LinearFeedback
 
 if TYPE_CHECKING:
-    from .smooth import Smooth
+    from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 PythonLaw: TypeAlias = Callable[[float, Array, Array], ArrayLike]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import EngineError
+from ...errors import EngineError
 
 Array = NDArray[np.float64]
 

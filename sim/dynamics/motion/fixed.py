@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compile.program import address, in_parallel
-from ..compile.rollout import fixed_steps
-from ..errors import EngineError
-from ..integrate.tableau import Tableau
-from .laws import LinearFeedback
+from ...compile.program import address, in_parallel
+from ...compile.rollout import fixed_steps
+from ...errors import EngineError
+from ...integrate.tableau import Tableau
+from ..laws import LinearFeedback
 from .loops import PARALLEL_OPERATIONS, Loop, compiled_loop, finish
 from .path import Path
 from .rows import (
@@ -28,7 +28,7 @@ from .rows import (
 )
 
 if TYPE_CHECKING:
-    from .smooth import Smooth
+    from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 

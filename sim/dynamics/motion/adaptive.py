@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compile.adaptive import adaptive_steps
-from ..compile.program import address, in_parallel
-from ..compile.step_control import GUARDED, OK, STATISTICS
-from ..errors import EngineError
-from ..integrate.tableau import Tableau
-from .laws import LinearFeedback
-from .layout import Layout
+from ...compile.adaptive import adaptive_steps
+from ...compile.program import address, in_parallel
+from ...compile.step_control import GUARDED, OK, STATISTICS
+from ...errors import EngineError
+from ...integrate.tableau import Tableau
+from ..laws import LinearFeedback
+from ..layout import Layout
 from .loops import Guards, Loop, compiled_loop, finish
 from .path import STATUS, Path
 from .prescribed import Pieces, constant, ends, pieces_of
 from .rows import NO_MOTION, NOTHING, Controls, Prescribed, Start, control_rows, parameter_rows
 
 if TYPE_CHECKING:
-    from .smooth import Smooth
+    from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 

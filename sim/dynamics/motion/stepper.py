@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compile.program import address
-from ..integrate.tableau import Tableau
+from ...compile.program import address
+from ...integrate.tableau import Tableau
 from .fixed import fixed_loop
 
 if TYPE_CHECKING:
-    from .smooth import Smooth
+    from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Motions of a compiled model over time: arguments, compiled loops, results."""
