@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from pantograph.controllers.fit import Phase, check, fit, machine, prove
+from pantograph.controllers.fit.charts import Charts
 from pantograph.controllers.fit.task import task_of
+from pantograph.controllers.nominal import difference, moved
 from pantograph.models import load_model
 from pantograph.sim import PantographError, load
 from pantograph.sim.clip import Clip, FreeTrack
@@ -28,6 +30,11 @@ SLIDER = mujoco.MjModel.from_xml_string(
 BALL = mujoco.MjModel.from_xml_string(
     """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="ball" type="ball"/>
     <geom size=".1" mass="2"/></body></worldbody></mujoco>"""
+)
+FLOAT = mujoco.MjModel.from_xml_string(
+    """<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/><body pos=".3 0 0">
+    <joint name="ball" type="ball"/><geom size=".1"/><body pos=".3 0 0"><joint name="hinge"/>
+    <geom size=".1"/></body></body></body></worldbody></mujoco>"""
 )
 SATELLITE = mujoco.MjModel.from_xml_string(
     """<mujoco><option gravity="0 0 0"/><worldbody><body><freejoint name="root"/>
@@ -165,6 +172,34 @@ def test_a_jump_pushes_off_flies_and_lands():
     assert 2 * fall == pytest.approx(-9.81, rel=0.02)
     np.testing.assert_allclose(np.array(feet)[ground], 0.0, atol=2e-4)
     assert found.clip.evaluate(0.75).q[1] == pytest.approx(height + 0.3, abs=1e-8)
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_charts_are_those_of_the_manifold(seed):
+    """By MuJoCo's integration and differences; rates and clips by differences in time."""
+    rng, charts, eps = np.random.default_rng(seed), Charts(FLOAT), 1e-6
+    nv = FLOAT.nv
+    q = moved(FLOAT, FLOAT.qpos0, rng.normal(size=nv))
+    d, v = rng.uniform(-1, 1, (2, nv))
+    to = moved(FLOAT, q, d)
+    np.testing.assert_allclose(np.asarray(charts.moved(q, d)).ravel(), to, atol=1e-14)
+    np.testing.assert_allclose(np.asarray(charts.apart(q, to)).ravel(), d, atol=1e-12)
+    ends = [difference(FLOAT, q, moved(FLOAT, to, s * eps * v)) for s in (1, -1)]
+    np.testing.assert_allclose(
+        np.asarray(charts.rate(d, v)).ravel(), (ends[0] - ends[1]) / (2 * eps), atol=1e-8
+    )
+    t = np.array([0.0, 0.4, 1.0])
+    rows, vs = np.array([q, to, moved(FLOAT, to, 0.5 * v)]), rng.normal(size=(3, nv))
+    a0, a1 = rng.normal(size=(2, 2, nv))
+    clip = charts.clip(t, rows, vs, a0, a1, Clip(FLOAT, {}))
+    now, end = clip.evaluate(t[:-1]), clip.evaluate(t[1:], left=True)
+    for got, wanted in ((now.v, vs[:-1]), (now.a, a0), (end.v, vs[1:]), (end.a, a1), (end.q, rows[1:])):
+        np.testing.assert_allclose(got, wanted, atol=1e-9)
+    fine = np.linspace(0.01, 0.39, 5)
+    later, sooner = clip.evaluate(fine + eps), clip.evaluate(fine - eps)
+    speed = [difference(FLOAT, *pair) / (2 * eps) for pair in zip(sooner.q, later.q, strict=True)]
+    np.testing.assert_allclose(clip.evaluate(fine).v, speed, atol=1e-6)
 
 
 def test_a_turn_is_the_cubic_about_its_axis():
