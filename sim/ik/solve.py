@@ -38,6 +38,9 @@ def solve(
 ) -> Solution:
     """Configuration of `model` that meets `goals`, always within joint limits, with a verdict.
 
+    Questions that differ in targets, weights or limits alone share one piece of machine code, compiled
+    when NumPy has taken as long as that would, and kept on disk; the answers are the same to rounding.
+
     Args:
         model: constant; its active connect, weld and joint equalities that the goals touch hold, too.
         goals: hard ones (no weight) are met exactly or judged; weighted ones as well as those allow. When all

@@ -1,1 +1,1 @@
-"""Chains to one frame: closed forms, and searches in machine code."""
+"""Chains and trees: closed forms, and goals, descents and searches in machine code."""
