@@ -15,6 +15,7 @@ from pantograph.sim.ik import (
     Pole,
     Pose,
     Position,
+    Posture,
     blend,
     follow,
     lock,
@@ -416,7 +417,19 @@ def test_mistakes_are_told():
         follow(model, [[JointValue("elbow", 0)]], [0, 1, 2])
     with pytest.raises(ModelError, match="velocity must be positive"):
         Follower(model, dt=0.01, velocity=-1)
+    with pytest.raises(ModelError, match="positive time"):
+        Follower(model, dt=0.0)
+    with pytest.raises(ModelError, match="value of joint 'elbow' must be finite"):
+        JointValue("elbow", np.nan)
+    with pytest.raises(ModelError, match="finite"):
+        Posture([np.nan] * 6)
+    with pytest.raises(ModelError, match=r"6 numbers \(nq\), not 2"):
+        solve(model, Posture([0, 0]))
+    with pytest.raises(ModelError, match="3 x 6 finite"):
+        lock(model, [0, 0.1, 0.2], np.zeros((3, 5)), {"tip": [(0, 0.1)]})
+    with pytest.raises(ModelError, match="share for each row"):
+        blend(model, np.zeros((3, 6)), np.zeros((3, 6)), [0, 1])
     with pytest.raises(ModelError, match="end after it starts"):
-        lock(model, [0, 1], np.zeros((2, 6)), {"tip": [(1, 0)]})
+        lock(model, [0, 1, 2], np.zeros((3, 6)), {"tip": [(1, 0)]})
     with pytest.raises(ModelError, match="below the reach"):
         soften([0, 0, 0], [1, 0, 0], 1.0, 2.0)

@@ -170,6 +170,11 @@ def blend(
     """
     space = Space(model)
     fk, ik = np.atleast_2d(np.asarray(q_fk, dtype=float)), np.atleast_2d(np.asarray(q_ik, dtype=float))
+    if fk.shape != ik.shape or fk.shape[1] != model.nq or np.size(share) not in (1, len(fk)):
+        raise ModelError(
+            f"a blend needs two motions of {model.nq} columns (nq) and one length, and a share for each row; "
+            f"these have shapes {fk.shape}, {ik.shape} and {np.shape(share)}"
+        )
     d = space.difference(ik, fk) * np.broadcast_to(np.asarray(share, dtype=float), (len(fk),))[:, None]
     if joints is not None:
         ids = [lookup(model, "joint", name) for name in joints]
@@ -217,6 +222,8 @@ def lock(
     ModelError for times that are not evenly spaced, or stances that end before they start.
     """
     t, q = np.asarray(t, dtype=float), np.array(q, dtype=float)
+    if q.shape != (t.size, model.nq) or not np.isfinite(q).all():
+        raise ModelError(f"a motion at {t.size} times is {t.size} x {model.nq} finite numbers, not {q.shape}")
     space, kinematics = Space(model), Kinematics(model)
     out, slip, met = space.clip(q), np.zeros(len(t)), np.ones(len(t), dtype=bool)
     places = {name: _places(kinematics, name, t, q, list(spans)) for name, spans in stances.items()}

@@ -324,8 +324,8 @@ class Distance(Goal):
         super().__post_init__()
         if not isinstance(self.to, str):
             object.__setattr__(self, "to", vector("to", self.to))
-        if not self.distance >= 0:
-            raise ModelError(f"a distance is not negative: {self.distance}")
+        if not 0 <= self.distance < np.inf:
+            raise ModelError(f"a distance is finite and not negative, not {self.distance}")
 
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.to) if isinstance(self.to, str) else (self.at,)

@@ -71,7 +71,7 @@ class Follower:
         joints: names of the joints that may move; default all that the goals depend on.
         apart: pairs of geoms that keep `clearance` [m].
 
-    Raises ModelError for limits that are not positive.
+    Raises ModelError for ticks or limits that are not positive, and names that do not exist.
     """
 
     def __init__(
@@ -86,6 +86,8 @@ class Follower:
         apart: Sequence[tuple[str, str]] = (),
         clearance: float = 0.01,
     ):
+        if not (np.isfinite(dt) and dt > 0):
+            raise ModelError(f"a tick lasts a positive time, not {dt} s")
         self.model, self.dt, self.joints = model, dt, joints
         self.space, self.kinematics = Space(model), Kinematics(model)
         self.q = self.space.check(model.qpos0 if q0 is None else q0)

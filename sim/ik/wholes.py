@@ -58,6 +58,11 @@ class JointValue(Goal):
     joint: str
     value: float
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not np.isfinite(self.value):
+            raise ModelError(f"the value of joint {self.joint!r} must be finite, not {self.value}")
+
     @property
     def label(self) -> str:
         return self.name or f"joint {self.joint}"
@@ -95,6 +100,13 @@ class Posture(Goal):
 
     q: ArrayLike
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        q = np.array(self.q, dtype=float)
+        if q.ndim != 1 or not np.isfinite(q).all():
+            raise ModelError(f"a posture is one row of finite numbers, not {self.q!r:.200}")
+        object.__setattr__(self, "q", q)
+
     @property
     def label(self) -> str:
         return self.name or "posture"
@@ -110,6 +122,9 @@ class Posture(Goal):
         return (unit,) * int(model.nv)
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
+        if len(np.asarray(self.q)) != kinematics.model.nq:
+            n, nq = len(np.asarray(self.q)), kinematics.model.nq
+            raise ModelError(f"a posture of this model is {nq} numbers (nq), not {n}")
         return np.ones(kinematics.model.nv, dtype=bool)
 
     def rows(self, c: Configurations) -> Rows:
