@@ -200,6 +200,18 @@ def test_contact_differences_equal_exact_derivatives_where_nothing_touches():
     np.testing.assert_allclose(theirs.B, exact.B, atol=1e-7)
 
 
+@pytest.mark.parametrize("which", [0, 1])
+def test_contact_differences_with_keyed_joints_equal_exact_derivatives_too(which):
+    model, keyed = load_model("double_pendulum"), np.arange(2) == which
+    point = np.array([0.7, -1.1]), np.array([0.5, 2.0]), np.array([1.0, -0.3])
+    words = {"keyed": keyed, "a_keyed": np.array([3.0, -2.0])}
+    exact, theirs = linearise(model, *point, **words), linearise_contact(model, *point, **words)
+    assert theirs.states == exact.states
+    assert theirs.inputs == exact.inputs
+    np.testing.assert_allclose(theirs.A, exact.A, atol=1e-5)
+    np.testing.assert_allclose(theirs.B, exact.B, atol=1e-5)
+
+
 def test_contact_differences_feel_the_floor():
     xml = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .0999"><freejoint/>
       <geom type="sphere" size=".1" mass="1"/></body></worldbody></mujoco>"""
@@ -408,10 +420,14 @@ def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
     plan = make_plan(scene)
     found, K = loop_of(plan, "pd", words, t=0.4)
     assert found.states[:2] == ("shoulder", "elbow")
-    free = [i for i, s in enumerate(found.states[: len(found.states) // 2])]
-    n = len(free)
+    n = len(found.states) // 2
     np.testing.assert_allclose(K[:2, n : n + 2], np.diag([30.0, 20.0]), atol=1e-5)
-    q, nominal = plan.problem.clip.evaluate(0.4).q, Nominal(plan.problem.model)
+    (q, v, a), nominal = plan.problem.clip.evaluate(0.4), Nominal(plan.problem.model)
+    tracked, keyed = np.isin(np.arange(6), [1, 2]), np.arange(6) == 0
+    here = linearise(
+        plan.problem.model, q, v, nominal.inverse(q, v, a), keyed=keyed, a_keyed=a, inputs=tracked
+    )
+    np.testing.assert_allclose(found.A, held(here, 0.002).A, atol=1e-12)
     for i, dof in enumerate((1, 2)):
         unit = 1e-5 * np.eye(6)[dof]
         slope = (nominal.weight(q + unit) - nominal.weight(q - unit))[[1, 2]] / 2e-5

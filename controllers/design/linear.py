@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...models import name_of
+from ...sim.engines.prescribe import Prescriber
 from ...sim.kinds import BALL, FREE
 from ..nominal import Nominal, moved
 
@@ -88,38 +89,43 @@ def linearise_contact(
     tau: ArrayLike | None = None,
     *,
     inputs: NDArray[np.bool_] | None = None,
+    keyed: NDArray[np.bool_] | None = None,
+    a_keyed: ArrayLike | None = None,
     step: float = 1e-6,
 ) -> LinearSystem:
     """As :func:`linearise`, by centred differences of MuJoCo's accelerations, contacts and limits included.
 
-    ``step`` is the difference in rad, m and (scaled by the joint's weight) N m: errors are about its square
-    and 1e-10/step. What touches and slides at the point is taken to go on doing so.
+    Without ``tau`` no joint force acts. ``step`` is the difference in rad, m and (scaled by the joint's
+    weight) N m: errors are about its square and 1e-10/step, ten times that with keyed joints. What touches
+    and slides at the point is taken to go on doing so.
     """
     bare = Nominal(model).model
     bare.opt.disableflags = int(model.opt.disableflags)
     nv, data = model.nv, mujoco.MjData(bare)
     q, v = np.asarray(q, dtype=float), np.zeros(nv) if v is None else np.asarray(v, dtype=float)
     tau = np.zeros(nv) if tau is None else np.asarray(tau, dtype=float)
+    acc = np.zeros(nv) if a_keyed is None else np.asarray(a_keyed, dtype=float)
+    free = np.ones(nv, dtype=bool) if keyed is None else ~keyed
+    prescribed = Prescriber(bare, ~free)
 
     def acceleration(dq: Array, dv: Array, dtau: Array) -> Array:
-        mujoco.mj_resetData(bare, data)
-        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = moved(model, q, dq), v + dv, tau + dtau
-        mujoco.mj_forward(bare, data)
-        return np.array(data.qacc)
+        mujoco.mj_resetData(prescribed.model, data)
+        data.qpos[:], data.qvel[:] = moved(model, q, dq), v + dv
+        prescribed.settle(data, tau + dtau, acc[~free])
+        return np.array(data.qacc)[free]
 
     none, size = np.zeros(nv), step * max(1.0, float(np.abs(tau).max(initial=0.0)))
     blocks = []
     for place, h in ((0, step), (1, step), (2, size)):
         columns = []
-        for unit in h * np.eye(nv):
+        for unit in h * np.eye(nv)[free]:
             plus, minus = [none] * 3, [none] * 3
             plus[place], minus[place] = unit, -unit
             columns.append((acceleration(*plus) - acceleration(*minus)) / (2.0 * h))
         blocks.append(np.column_stack(columns))
-    free = np.ones(nv, dtype=bool)
-    chosen = free if inputs is None else inputs
+    chosen = free if inputs is None else inputs & free
     by_q, by_v, by_tau = (block[None] for block in blocks)
-    A, B = _blocks(model, free, v[None], by_q, by_v, by_tau[:, :, chosen])
+    A, B = _blocks(model, free, v[None], by_q, by_v, by_tau[:, :, chosen[free]])
     return _named(model, free, chosen, A[0], B[0])
 
 
