@@ -373,6 +373,15 @@ def test_a_changed_model_or_question_is_not_taken_for_an_earlier_one(eager):
         assert solution.residuals[1].position == pytest.approx(truth, abs=1e-9)
 
 
+def test_a_posture_of_another_length_is_refused_after_a_right_one(eager):
+    model = ik_cases.planar_chain([1.0, 0.8, 0.6])
+    goal = Position("tip", [1.2, 0.7, 0])
+    for _ in range(2):
+        assert solve(model, [goal, Posture([0.1, 0.2, 0.3], weight=0.1)]).solved
+    with pytest.raises((ModelError, ValueError)):
+        solve(model, [goal, Posture([0.1, 0.2], weight=0.1)])
+
+
 def test_questions_of_one_kind_do_not_disturb_each_other():
     model = load_model("puppet")
     problem, _ = asked(model, [Position("left_hand", [0.4, 0.3, 1.0])], None)

@@ -303,7 +303,7 @@ def words(goal: Goal) -> list[str | tuple[str, ...]]:
     """A goal without its numbers: its kind, and the names it gives in order."""
     own = [getattr(goal, key) for key in goal.__dataclass_fields__ if key != "name"]
     names = [x for x in own if isinstance(x, str) or (isinstance(x, tuple) and x and isinstance(x[0], str))]
-    return [type(goal).__name__, *("-" if x is None else "." for x in own), *names]
+    return [type(goal).__name__, *("-" if x is None else str(np.shape(x)) for x in own), *names]
 
 
 class _Absent(Exception):
