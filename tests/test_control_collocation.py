@@ -342,6 +342,14 @@ def test_a_scene_says_machine_and_contacts(tmp_path):
         run.invoke(app, [str(scene)], catch_exceptions=False)
 
 
+def test_forces_missing_between_nodes_fall_with_the_third_power():
+    clip = Clip(ACROBOT, {"elbow": keyed([0, 1.0], [0.0, 1.0], kind="clamped")}, ACROBOT.qpos0)
+    able = machine(ACROBOT, driven=np.array([False, True]))
+    words = {"at_rest": False, "refine": 0, "effort": 1e-4}
+    left = [fit(clip, able, step=h, **words).certificate.dynamics for h in (0.05, 0.025)]
+    assert np.log2(left[0] / left[1]) > 2.5
+
+
 def test_ctrl_c_ends_a_fit():
     seen = []
 

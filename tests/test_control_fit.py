@@ -182,6 +182,7 @@ def test_a_missing_drive_is_a_violation():
     report = check(still, able)
     assert [v.kind for v in report.violations] == ["missing force"]
     assert report.violations[0].value == pytest.approx(abs(able.nominal.weight(ARM.qpos0)[1]), rel=1e-9)
+    assert np.isinf(machine(ARM, driven=able.driven, velocity=1.0).velocity).tolist() == [False, True]
     ground = Phase(0.0, 1.0, ("tip",), ground=None)
     assert check(still, able, phases=[ground]).possible
     late = Phase(0.5, 1.0, ("tip",), ground=None)
@@ -219,6 +220,7 @@ def test_check_says_where_and_by_how_much():
     assert found["velocity"].stop == pytest.approx(1 - cross, abs=1e-3)
     assert found["acceleration"].share == pytest.approx(6 / 5, rel=1e-3)
     assert "acceleration" in str(found["acceleration"])
+    assert found["jerk"].share == np.inf  # it starts from rest with an acceleration
     assert not report.possible
     assert check(clip, machine(ARM, velocity=1.6, acceleration=6.1, force=np.inf)).possible
     far = Clip(ARM, {"elbow": keyed([0, 1], [0.0, 3.1], kind="clamped")}, ARM.qpos0)
