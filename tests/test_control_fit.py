@@ -220,7 +220,8 @@ def test_check_says_where_and_by_how_much():
     assert found["velocity"].stop == pytest.approx(1 - cross, abs=1e-3)
     assert found["acceleration"].share == pytest.approx(6 / 5, rel=1e-3)
     assert "acceleration" in str(found["acceleration"])
-    assert found["jerk"].share == np.inf  # it starts from rest with an acceleration
+    assert found["jerk"].share == np.inf
+    assert (found["jerk"].start, found["jerk"].stop) == (0.0, 1.0)  # out of rest and into it
     assert not report.possible
     assert check(clip, machine(ARM, velocity=1.6, acceleration=6.1, force=np.inf)).possible
     far = Clip(ARM, {"elbow": keyed([0, 1], [0.0, 3.1], kind="clamped")}, ARM.qpos0)
