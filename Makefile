@@ -25,7 +25,7 @@ $(VENV)/.installed: pyproject.toml .ci/constraints.txt | $(BIN)/python
 	@touch $@
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(PIP) --constraint .ci/constraints.txt --editable ".[torch]" --group test
+	$(PIP) --constraint .ci/constraints.txt --editable ".[torch,parquet]" --group test
 	@mkdir -p .types && ln -sfn .. .types/pantograph
 	@touch $@
 
