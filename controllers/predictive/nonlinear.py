@@ -158,7 +158,8 @@ class NMPC:
         dx, du = x - ref.x, u - ref.u
         beyond = np.maximum(x[:, :nv] - self.q_high, 0.0) + np.maximum(self.q_low - x[:, :nv], 0.0)
         share = ref.h / self.step
-        total = float(share @ (dx[:-1] ** 2 @ self.Q + du**2 @ self.R) + dx[-1] @ self.final @ dx[-1])
+        with np.errstate(over="ignore"):  # a plan that flies off costs infinitely much
+            total = float(share @ (dx[:-1] ** 2 @ self.Q + du**2 @ self.R) + dx[-1] @ self.final @ dx[-1])
         return total + float(np.sum(beyond**2 @ self.soft))
 
     def improve(self, x: Array, u: Array, ref: Horizon, iterations: int) -> tuple[Array, Array, float]:
