@@ -147,7 +147,9 @@ def figure(comparison: Comparison) -> Figure:
     bottom.set_ylabel("RMS error [rad, m]")
     middle.set_xlabel("time [s]")
     bottom.set_yscale("log")
-    bottom.set_xticks(range(len(comparison.rows)), [row.variant.name for row in comparison.rows])
+    names = [row.variant.name.replace(" ", "\n", 1) for row in comparison.rows]
+    slant = {"rotation": 20, "ha": "right"} if len(names) > 4 else {}
+    bottom.set_xticks(range(len(names)), names, fontsize=9, **slant)
     bottom.set_title("as modelled (bars) and disturbed (dots)", fontsize=10)
     top.legend(fontsize=8, ncols=3)
     for ax in (top, middle, bottom):

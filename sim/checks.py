@@ -11,6 +11,7 @@ from .engines.prescribe import prescribed_bodies
 from .kinds import HINGE, SCALAR
 from .scene.build import Setup
 
+_LOOKS = 500  # at keyed motion
 _DEEP = 1e-3  # m; shallower overlaps are within the softness of contacts
 
 
@@ -19,6 +20,24 @@ def check_frames(setup: Setup, t: Array, q: Array) -> list[str]:
     if not len(t):
         return []
     return _limits(setup, t, q) + _overlaps(setup, t, q)
+
+
+def keys_beyond_limits(setup: Setup) -> list[str]:
+    """Joints whose controller is asked for places that their limits do not let through."""
+    m, out = setup.model, []
+    keyed = [m.joint(name).id for name in setup.clip.tracks]
+    tracked = [j for j in keyed if setup.roles[j] == Role.TRACKED and int(m.jnt_type[j]) in SCALAR]
+    q = setup.clip.evaluate(np.linspace(0.0, setup.scene.duration, _LOOKS))[0]
+    for j in tracked:
+        if not (setup.scene.physics.limits and m.jnt_limited[j]):
+            continue
+        low, high = m.jnt_range[j]
+        x = q[:, m.jnt_qposadr[j]]
+        worst = x[int(np.argmax(np.maximum(low - x, x - high)))]
+        if not low - 1e-9 <= worst <= high + 1e-9:
+            unit = "rad" if m.jnt_type[j] == HINGE else "m"
+            out.append(f"{name_of(m, 'joint', j)} {worst:.3g} {unit} outside [{low:.4g}, {high:.4g}]")
+    return out
 
 
 def _limits(setup: Setup, t: Array, q: Array) -> list[str]:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from ..models import name_of
+from .checks import keys_beyond_limits
 from .compose import make_law
 from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
@@ -377,6 +378,9 @@ def _left_out(setup: Setup, engine: str) -> list[str]:
     unmoved = [n for n in setup.clip.tracks if setup.roles[setup.model.joint(n).id] == Role.PASSIVE]
     if unmoved:
         out.append(f"keys of passive joints, but for where these start: {', '.join(unmoved)}")
+    beyond = keys_beyond_limits(setup)
+    if beyond:
+        out.append(f"keys that joint limits do not let through: {'; '.join(beyond)}")
     idle = [name_of(setup.model, "actuator", int(i)) for i in np.flatnonzero(setup.drives == Drive.OFF)]
     if scene.controller is not None and _period(setup) is None:
         out.append("the controller: no joint is tracked by it and no actuator driven by it")

@@ -48,6 +48,24 @@ def test_every_joint_and_actuator_is_listed_under_what_moves_it():
     assert idle == "actuators that nothing drives: waist, forearm_roll, tool_roll"
 
 
+@pytest.mark.parametrize(
+    ("top", "physics", "told"), [(1.4, {}, True), (1.19, {}, False), (1.4, {"limits": False}, False)]
+)
+def test_keys_that_limits_hold_back_are_told(top, physics, told):
+    """The elbow's range ends at 1.2 rad; between its keys the curve stays below the highest."""
+    plan = plan_of(
+        models=[{"file": "arm6"}],
+        roles={"tracked": ["elbow"]},
+        keys=[{"joint": "elbow", "times": [0, 0.5, 1], "values": [0, top, 0]}],
+        controller={"law": "pd"},
+        physics=physics,
+    )
+    said = [line for line in plan.left_out if line.startswith("keys that joint limits")]
+    assert said == (
+        ["keys that joint limits do not let through: elbow 1.4 rad outside [-2.6, 1.2]"] if told else []
+    )
+
+
 periods = st.floats(1e-3, 0.05)
 
 
