@@ -42,7 +42,8 @@ def program():
 
     eigen = Path(casadi.__file__).parent / "include" / "eigen3"  # CasADi's package carries Eigen's headers
     command = ["g++", *FLAGS.split(), f"-I{prefix}/include", f"-I{eigen}", SOURCE, "-o", binary]
-    command += [f"-L{prefix}/lib", "-lpinocchio_default", f"-Wl,-rpath,{prefix}/lib"]
+    here = f"$ORIGIN/{prefix.relative_to(VENV)}/lib"
+    command += [f"-L{prefix}/lib", "-lpinocchio_default", f"-Wl,-rpath,{here}"]
     print("compiling Pinocchio's timing program, once: a few minutes ...", flush=True)
     built = subprocess.run(command, capture_output=True, text=True)
     return binary if built.returncode == 0 else f"absent: {built.stderr.splitlines()[0][:200]}"
