@@ -159,3 +159,40 @@ def test_keyed_limbs_are_limbs_as_well():
     equations = Equations(model, Layout(model, hinges))
     (legs,) = equations.tape("q v w", {"a": equations.q}).limbs
     assert [len(leg) for leg in legs] == [9] * 4  # position, velocity and acceleration of three joints
+
+
+def many_legged(legs, kinds, rng):
+    """A floating body with legs of the same joints, each with its own lengths and masses."""
+
+    def vector(x):
+        return " ".join(map(str, x))
+
+    def leg(depth=0):
+        if depth == len(kinds):
+            return ""
+        joint = {"x": 'axis="1 0 0"', "y": 'axis="0 1 0"', "ball": 'type="ball"'}[kinds[depth]]
+        inertial = f'<inertial pos="{vector(rng.normal(size=3) * 0.1)}" mass="{rng.uniform(0.5, 1.5)}"'
+        inertial += ' diaginertia="0.01 0.012 0.011"/>'
+        place = vector(rng.normal(size=3) * 0.2)
+        return f'<body pos="{place}"><joint {joint}/>{inertial}{leg(depth + 1)}</body>'
+
+    trunk = '<freejoint/><inertial pos="0.01 0.02 0" mass="3" diaginertia="0.1 0.1 0.12"/>'
+    body = f"<body>{trunk}{''.join(leg() for _ in range(legs))}</body>"
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+
+
+@pytest.mark.parametrize("legs", [2, 3, 9])
+@pytest.mark.parametrize("kinds", [("x", "y", "y"), ("ball", "y")])
+def test_any_number_of_legs_has_mujocos_accelerations(legs, kinds):
+    rng = np.random.default_rng(legs)
+    model = many_legged(legs, kinds, rng)
+    smooth, data = compile_model(model, lanes=1), mujoco.MjData(model)
+    for _ in range(5):
+        data.qpos[:], data.qvel[:] = rng.normal(size=model.nq), rng.normal(size=model.nv)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_forward(model, data)
+        error = np.abs(smooth.forward(data.qpos, data.qvel) - data.qacc).max()
+        assert error <= 1e-11 * np.abs(data.qacc).max()
+    tape = smooth.tape("forward")
+    packed = sum(len(pack.rows) for pack in find_packs(tape) if pack.op != g.INPUT)
+    assert packed > sum(tape.counts.values()) / 2
