@@ -210,8 +210,7 @@ def test_wrenches_on_bodies_act_as_in_mujoco():
 @pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
 def test_our_models_agree_over_the_whole_state_space(path):
     model = unconstrained(mujoco.MjModel.from_xml_path(str(path)))
-    if missing := unsupported(model):
-        pytest.skip(f"the smooth engine does not do {path.stem}: {missing[0]}")
+    assert not unsupported(model)
     eq = equations(model)
     q, v, act, u = states_of(model, 1, 40)
     n = len(q)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,7 +37,7 @@ class Moment(NamedTuple):
     met: bool
 
 
-class Run:
+class Run(ABC):
     """State of one run: the whole model's q, v, act at `offset` seconds after its start."""
 
     def __init__(
@@ -75,9 +76,9 @@ class Run:
             raise Broken(segment) from failure
         return segment
 
+    @abstractmethod
     def advance(self, progress: Callable[[float], None] | None) -> str:
         """Move the state to the end, keeping samples; why the state makes no sense, or an empty string."""
-        raise NotImplementedError
 
     @property
     def now(self) -> float:
