@@ -368,13 +368,6 @@ def bulk_read(wanted: Iterable[tuple[int, int, int]], *, fast: bool = False) -> 
     return Packet(BROADCAST, instruction, b"".join(bytes((s,)) + _words(a, n) for s, a, n in wanted))
 
 
-def bulk_write(blocks: Iterable[tuple[int, int, bytes]]) -> Packet:
-    """Write data at (servo, address) of each; nobody answers."""
-    return Packet(
-        BROADCAST, Instruction.BULK_WRITE, b"".join(bytes((s,)) + _words(a, len(d)) + d for s, a, d in blocks)
-    )
-
-
 def fast_reply(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
     """Bytes on the wire of a fast read reply with (error, servo, data) of each.
 

@@ -9,8 +9,11 @@ import numpy as np
 
 from .control import Replay
 from .engines.interface import Array, Engine, Problem, Segment
+from .errors import EngineError
 from .kinds import BALL, FREE, HINGE
 from .recording import ErrorEstimate
+
+_TIGHTEST = 1e-12  # tolerance that leaves room for a hundred times tighter run
 
 
 def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: float | None) -> ErrorEstimate:
@@ -52,7 +55,11 @@ def _estimate_adaptive(
 ) -> ErrorEstimate:
     """Difference to a run at a hundredth of the tolerance, whose own error is small beside it."""
     assert problem.tolerance is not None
-    tighter = dataclasses.replace(problem, tolerance=max(problem.tolerance / 100, 1e-14))
+    if problem.tolerance < _TIGHTEST:
+        raise EngineError(
+            f"below a tolerance of {_TIGHTEST:g} rounding leaves nothing tighter to compare with"
+        )
+    tighter = dataclasses.replace(problem, tolerance=problem.tolerance / 100)
     finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), replay)
     if finer.status == "interrupted":
         raise KeyboardInterrupt

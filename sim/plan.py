@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -13,7 +13,7 @@ from .checks import keys_beyond_limits
 from .compose import make_law
 from .engines.contact import INTEGRATORS
 from .engines.interface import Drive, Problem, Role
-from .engines.smooth import adaptive_methods
+from .engines.smooth import adaptive_methods, width_of
 from .engines.smooth import methods as smooth_methods
 from .engines.touch import can_touch
 from .errors import SceneError, unknown
@@ -113,6 +113,8 @@ def plan_setup(setup: Setup) -> Plan:
         tolerance=scene.solver.tolerance,
         live=setup.live,
     )
+    # held while error estimates and reports change the step: another width is another friction
+    problem = replace(problem, friction_width=width_of(problem))
     if mistakes := _law(problem, scene):
         raise report(mistakes, scene._file, scene._lines)
     return Plan(
@@ -245,6 +247,9 @@ def why_not_smooth(setup: Setup, touch: bool) -> list[str]:
         reasons.append('bodies can touch (physics.contacts = "none" leaves that out)')
     if m.tendon_limited.any() and setup.scene.physics.limits:
         reasons.append("tendons have limits (physics.limits = false leaves them out)")
+    balls = (m.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (m.jnt_limited != 0) & (setup.roles != Role.KEYED)
+    if balls.any() and setup.scene.physics.limits:
+        reasons.append("ball joints have limits (physics.limits = false leaves them out)")
     fastest, step = fastest_rate(setup), setup.scene.solver.step
     h = float(m.opt.timestep) if step == "auto" else step
     if fastest * h > 1.0 and setup.scene.solver.tolerance is None:

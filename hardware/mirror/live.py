@@ -62,10 +62,14 @@ class Live:
             [sys.executable, "-m", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         assert self._process.stdin is not None
-        pickle.dump(self._scene, self._process.stdin)
-        self._process.stdin.close()
         self._thread.start()
-        self._take(wait=True)
+        try:
+            pickle.dump(self._scene, self._process.stdin)
+            self._process.stdin.close()
+            self._take(wait=True)
+        except BaseException:  # nothing else ends the process and the thread then
+            self.__exit__(None, None, None)
+            raise
         self.first = self._parts[0][1][0][self._qpos]
         return self
 

@@ -17,7 +17,6 @@ OP_NAMES = (
     *("const", "input", "add", "sub", "mul", "neg", "inv", "sqrt", "sin", "cos"),
     *("min", "max", "abs", "less", "atan2", "hold", "round"),
 )
-BINARY = frozenset((ADD, SUB, MUL, MIN, MAX, LESS, ATAN2))
 _COMMUTATIVE = frozenset((ADD, MUL, MIN, MAX))
 
 

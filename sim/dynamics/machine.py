@@ -92,7 +92,10 @@ class Machine:
     def key(self) -> str:
         """Hash over everything that compiled code of this model depends on."""
         lay = self.layout
-        roles = repr((lay.keyed, lay.timed, lay.wrenches, lay.forces, self.parameters, self.friction_width))
+        entries = [
+            parameter_index(self.model, p) for p in self.parameters
+        ]  # names are not in the fingerprint
+        roles = repr((lay.keyed, lay.timed, lay.wrenches, lay.forces, entries, self.friction_width))
         versions = repr((jit.llvm_version(), jit.host(), mujoco.mj_versionString()))
         return key_of(model_fingerprint(self.model), roles, versions, code_fingerprint())
 

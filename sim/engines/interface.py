@@ -103,6 +103,7 @@ class Problem:
     wrenches: tuple[Wrench, ...] = ()
     tolerance: float | None = None
     live: Callable[[float], Aims] | None = None
+    friction_width: float | None = None
 
     @property
     def steps(self) -> int:

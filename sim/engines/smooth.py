@@ -32,11 +32,18 @@ def differences(problem: Problem) -> list[str]:
     """Physics that this engine models otherwise than MuJoCo, as sentences; no matter of step or order."""
     from ..dynamics.support import differences as of_model
 
-    width = friction_width(problem.model, mobility(problem), problem.step)
+    width = width_of(problem)
     found = [f"otherwise than MuJoCo: {line}" for line in of_model(problem.model, friction_width=width)]
     if limits_of(problem).each:
         found.append(f"a joint that meets its limit stops there (restitution {RESTITUTION:g})")
     return found
+
+
+def width_of(problem: Problem) -> float | None:
+    """The `friction_width` of a problem: what it was planned with, whatever its step is now."""
+    if problem.friction_width is not None:
+        return problem.friction_width
+    return friction_width(problem.model, mobility(problem), problem.step)
 
 
 def friction_width(model: mujoco.MjModel, mobility: Array, step: float) -> float | None:

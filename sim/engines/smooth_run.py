@@ -15,7 +15,7 @@ from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
 from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
 from .limits import Limit, complementary, limits_of, slack
-from .smooth import RESTITUTION, friction_width, mobility
+from .smooth import RESTITUTION, width_of
 from .timed import Timed
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Run(ABC):
     @cached_property
     def width(self) -> float | None:
         """Speed below which dry friction is smoothed."""
-        return friction_width(self.problem.model, mobility(self.problem), self.h)
+        return width_of(self.problem)
 
     def model(self, resting: tuple[Limit, ...] | None = None) -> Compiled:
         """The compiled model, with the joints that rest at a limit taken out of the unknowns."""
@@ -286,7 +286,7 @@ class Run(ABC):
         nothing = Held(np.zeros(m.nu), np.zeros(m.nv))
         for resting in dict.fromkeys(self.rests[:n]):
             at = np.array([i for i in range(n) if self.rests[i] == resting])
-            c = self.compiled[resting]
+            c = self.model(resting)
             q, v = (rows([getattr(kept[i][1], x) for i in at], w) for x, w in (("q", m.nq), ("v", m.nv)))
             act = rows([kept[i][1].act for i in at], m.na)
             u = np.array([c.held(self.ticks[tick[i]][1] if tick[i] >= 0 else nothing) for i in at])

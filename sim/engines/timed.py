@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...models import name_of
 from ..clip import Clip
-from .interface import Array, Drive, Problem, Role
+from .interface import Array, Problem, Role
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,3 @@ def keyed_qpos(problem: Problem) -> NDArray[np.bool_]:
         start = m.jnt_qposadr[joint]
         mask[start : start + width[int(m.jnt_type[joint])]] = True
     return mask
-
-
-def driven_by_keys(problem: Problem) -> NDArray[np.bool_]:
-    """Actuators (nu,) mask whose ctrl comes from keys."""
-    return np.asarray(problem.drives == Drive.KEYS, dtype=bool)
