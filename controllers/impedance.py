@@ -58,7 +58,8 @@ class Impedance:
         J = np.where(self.tracked, now.J, 0.0)
         weight, null, inertia = self.projection.at(q, J)
         damper = 2.0 * self.damping * double_diagonal(weight, self.K)
-        force = weight @ (wanted.J @ target.a + wanted.drift - now.drift)
+        given = now.J @ np.where(self.tracked, 0.0, target.a)  # by joints that move as keyed
+        force = weight @ (wanted.J @ target.a - given + wanted.drift - now.drift)
         force += self.K @ self.task.error(now, wanted) + damper @ (wanted.velocity - now.velocity)
         rest = self.posture**2 * difference(self.model, q, target.q)
         rest += 2.0 * self.posture * (target.v - v) + target.a

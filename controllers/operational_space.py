@@ -84,4 +84,5 @@ class OperationalSpace:
         feed = wanted.J @ target.a + wanted.drift
         pull = self.w**2 * self.task.error(now, wanted)
         pull += 2.0 * self.damping * self.w * (wanted.velocity - now.velocity)
-        return feed + pull - now.drift
+        given = now.J @ np.where(self.tracked, 0.0, target.a)  # by joints that move as keyed
+        return feed + pull - now.drift - given

@@ -456,3 +456,23 @@ def test_felt_inertia_of_one_body_is_its_inertia():
     model = _with_motor()
     assert felt_inertia(model, model.qpos0)[0] == pytest.approx(0.4 * 0.01)
     assert difference(model, np.array([0.5]), np.array([0.2]))[0] == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize("law", ["operational-space", "impedance"])
+def test_task_space_laws_leave_to_keyed_joints_what_these_do(law):
+    """The waist turns the task as keyed; the arm is not asked to produce that acceleration."""
+    joints = ("shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll")
+    scene = Scene(
+        duration=0.5,
+        models=[{"file": "arm6"}],
+        roles={"tracked": list(joints)},
+        keys=[
+            {"joint": "waist", "times": [0, 0.25, 0.5], "values": [0, 0.6, 0]},
+            *({"joint": j, "times": [0], "values": [0.3]} for j in ("shoulder", "elbow", "wrist_pitch")),
+        ],
+        controller={"law": law, "site": "tip"},
+        physics={"contacts": "none"},
+    )
+    recording = run(scene)
+    assert recording.status == "done"
+    assert np.abs(recording.q[:, 1:5] - [0.3, 0.3, 0.0, 0.3]).max() < 0.15

@@ -845,3 +845,18 @@ def test_a_bound_function_runs_on_its_own_arrays():
     bound.inputs["q"][:], bound.inputs["v"][:] = (0.4, 0.2), (0.5, -0.3)
     bound()
     np.testing.assert_array_equal(bound.outputs["a"], smooth.forward([0.4, 0.2], [0.5, -0.3]))
+
+
+def test_models_alike_but_for_their_names_share_no_code(tmp_path):
+    def forward(first, second):
+        body = '<body name="{}" pos="{} 0 0"><joint axis="0 1 0"/>'
+        body += '<geom size="0.1" mass="{}" pos="0.3 0 0"/></body>'
+        xml = f"<mujoco><worldbody>{body.format(first, 0, 1)}{body.format(second, 1, 3)}</worldbody></mujoco>"
+        model = mujoco.MjModel.from_xml_string(xml)
+        smooth = compile_model(model, parameters=[("body_mass", "a")], cache=tmp_path)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        close(smooth.forward(data.qpos, data.qvel), data.qacc)
+
+    forward("a", "b")
+    forward("b", "a")

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -7,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.sim import Scene, SceneError, make_plan, run
 from pantograph.sim.engines.interface import Drive, Role
+from pantograph.sim.engines.smooth import width_of
 from pantograph.sim.engines.touch import can_touch
 from pantograph.sim.plan import fastest_rate
 
@@ -267,3 +269,18 @@ def test_keys_that_move_nothing_are_told(roles, said):
         Scene(duration=1, models=[{"file": "double_pendulum"}], keys=keys, roles=roles)
     ).left_out
     assert ("keys of passive joints, but for where these start: elbow" in left_out) == said
+
+
+def test_limits_of_balls_take_the_contact_engine(tmp_path):
+    file = tmp_path / "ball.xml"
+    file.write_text(
+        '<mujoco><worldbody><body><joint type="ball" range="0 0.3" limited="true"/>'
+        '<geom size="0.1" pos="0.3 0 0" contype="0" conaffinity="0"/></body></worldbody></mujoco>'
+    )
+    assert plan_of(models=[{"file": str(file)}]).engine.what == "contact"
+    assert plan_of(models=[{"file": str(file)}], physics={"limits": False}).engine.what == "smooth"
+
+
+def test_the_width_of_friction_stays_when_the_step_changes():
+    plan = plan_of(models=[{"file": "arm6"}], physics={"contacts": "none"})
+    assert plan.problem.friction_width == width_of(replace(plan.problem, step=plan.problem.step / 2)) > 0
