@@ -333,7 +333,7 @@ def real_time(console: Console) -> list[Figure]:
     )
     return [
         Figure("real time: rate kept over 15 s", rate, "Hz", ">= 99", rate >= 99),
-        at_most("real time: jitter, 99th percentile", 1e3 * float(np.quantile(jitter, 0.99)), 10.0, "ms"),
+        at_most("real time: jitter, 99th percentile", 1e3 * float(np.quantile(jitter, 0.99)), 5.0, "ms"),
         at_most("real time: jitter, median", 1e3 * float(np.median(jitter)), 0.5, "ms"),
     ]
 
