@@ -242,7 +242,9 @@ def lock(
         held = [Position(pose.at, pose.position, tolerance=_LOCKED) for pose, locked in wanted[k] if locked]
         if held:
             problem = Problem(model, held, space, joints=moving, kinematics=kinematics)
-            others = np.concatenate([space.clip(q[k][None]), _carried(space, out[max(k - 1, 0)], smooth[k], problem)])
+            others = np.concatenate(
+                [space.clip(q[k][None]), _carried(space, out[max(k - 1, 0)], smooth[k], problem)]
+            )
             out[k], slip[k] = _stood(problem, smooth[k], others)
             met[k] = slip[k] <= _LOCKED * 2
     return Locked(out, slip, met)
