@@ -4,19 +4,17 @@ A part is a function that returns figures; the last line is one JSON object of a
 named: python tests/bench/control.py gains tracking swing_up
 """
 
-import json
 import sys
 import time
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from control_figures import Figure, at_least, at_most, info
 from control_fit import PARTS as FIT
 from control_linear import PARTS as LINEAR
 from control_mpc import PARTS as MPC
+from figures import Figure, at_least, at_most, main, told
 from pantograph.controllers.basin import Catch, map_basin, picture
 from pantograph.controllers.design import LinearSystem, dlqr, held, lqr
 from pantograph.controllers.experiments import compare
@@ -29,7 +27,6 @@ from pantograph.sim import Scene, make_plan
 from pantograph.sim.dynamics.smooth import compile_model
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from oracles import control_gains
@@ -51,7 +48,7 @@ def gains(console: Console) -> list[Figure]:
         found = lqr(A, B, Q, R)
         error = float(np.abs(found.K[0] - K).max() / np.abs(K).max())
         figures.append(at_most(f"{case.__name__}: gain, relative error", error, 1e-9, ""))
-        figures.append(info(f"{case.__name__}: Riccati residual", found.residual, ""))
+        figures.append(told(f"{case.__name__}: Riccati residual", found.residual, ""))
         errors = []
         for T in (4e-4, 2e-4, 1e-4):
             n, m = B.shape
@@ -88,7 +85,7 @@ def tracking(console: Console) -> list[Figure]:
         ticks.append(trial.figures.tick)
     return [
         at_most("computed torque, exact model, 1 kHz: largest error of 5 clips", max(errors), 1e-6, "rad"),
-        info("computed torque: median tick", 1e6 * float(np.median(ticks)), "us"),
+        told("computed torque: median tick", 1e6 * float(np.median(ticks)), "us"),
     ]
 
 
@@ -112,9 +109,9 @@ def swing_up(console: Console) -> list[Figure]:
         for k, why in failures:
             console.print(f"{which}: start {k} of seed 0 fails: {why}")
         figures.append(at_least(f"{which}: swings up within 15 s and stays 10 s", share, 0.999, ""))
-        figures.append(info(f"{which}: median time to the top", float(np.median(arrived)), "s"))
-        figures.append(info(f"{which}: 99.9 % of times to the top", float(np.percentile(arrived, 99.9)), "s"))
-        figures.append(info(f"{which}: computing time a start", (time.perf_counter() - begun) / STARTS, "s"))
+        figures.append(told(f"{which}: median time to the top", float(np.median(arrived)), "s"))
+        figures.append(told(f"{which}: 99.9 % of times to the top", float(np.percentile(arrived, 99.9)), "s"))
+        figures.append(told(f"{which}: computing time a start", (time.perf_counter() - begun) / STARTS, "s"))
     return [*figures, basin()]
 
 
@@ -152,7 +149,7 @@ def basin() -> Figure:
     found = map_basin(catch, force_limits(model), (1, 2), (0.8, 1.2), points=121)
     OUT.mkdir(exist_ok=True)
     picture(found, ("lower angle [rad]", "upper angle, relative [rad]")).savefig(OUT / "basin.png", dpi=120)
-    return info(f"LQR basin, double pole on a cart ({OUT / 'basin.png'}): area", found.area, "rad^2")
+    return told(f"LQR basin, double pole on a cart ({OUT / 'basin.png'}): area", found.area, "rad^2")
 
 
 def robust(console: Console) -> list[Figure]:
@@ -161,32 +158,18 @@ def robust(console: Console) -> list[Figure]:
     for name, mass, push in (("masses wrong by 10 %", 0.1, 0.0), ("and pushed", 0.1, 0.2)):
         for row in compare(arm_scene(2e-3, 1), laws, trials=8, mass=mass, push=push).rows:
             law = row.variant.name
-            figures.append(info(f"{name}, {law}: RMS as modelled", row.nominal.rms, "rad"))
-            figures.append(info(f"{name}, {law}: worst RMS of 8", row.robust, "rad"))
+            figures.append(told(f"{name}, {law}: RMS as modelled", row.nominal.rms, "rad"))
+            figures.append(told(f"{name}, {law}: worst RMS of 8", row.robust, "rad"))
     plan = make_plan(arm_scene(1e-3, 0))
     heavy = Disturbance(mass=(1.1,) * plan.problem.model.nbody)
     for law in laws:
         worst = run_trial(plan, law, {}, heavy).figures.worst
-        figures.append(info(f"all masses 10 % larger, {law}: largest error", worst, "rad"))
+        figures.append(told(f"all masses 10 % larger, {law}: largest error", worst, "rad"))
     return figures
 
 
 PARTS = {"gains": gains, "tracking": tracking, "robust": robust, "swing_up": swing_up, **LINEAR, **FIT, **MPC}
 
 
-def main() -> int:
-    console = Console()
-    chosen = sys.argv[1:] or list(PARTS)
-    figures = [figure for name in chosen for figure in PARTS[name](console)]
-    table = Table(title="Control")
-    for name in ("figure", "value", "unit", "bar", "holds"):
-        table.add_column(name)
-    for f in figures:
-        table.add_row(f.name, f"{f.value:.4g}", f.unit, f.bar, "yes" if f.holds else "[red]NO[/red]")
-    console.print(table)
-    print(json.dumps({"bench": "control", "figures": [asdict(f) for f in figures]}))
-    return 0 if all(f.holds for f in figures) else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main("control", PARTS))

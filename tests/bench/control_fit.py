@@ -2,12 +2,11 @@
 
 import json
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from control_figures import Figure, at_least, at_most, info
+from figures import Figure, absent, at_least, at_most, environment, last_line, told
 from pantograph.controllers.fit import check, fit, machine, prove, retime
 from pantograph.controllers.fit.task import task_of
 from pantograph.models import ModelError, load_model
@@ -20,25 +19,20 @@ from rich.progress import track
 PATHS, KEYS, SECONDS = 100, 6, 4.0
 POINTS = (250, 1000)
 SPEED, BEND, JERK = 3.0, 10.0, 100.0  # rad/s, rad/s^2, rad/s^3
+NO_ROBOT = "no wx250s here (set PANTOGRAPH_DATA)"
 SCENES = Path(__file__).parents[2] / "models" / "scenes"
-VENV = Path(".bench/toppra")
 
 
-def peer(job: dict) -> list | None:
-    """toppra's results, installed into an environment of its own; None when it cannot be."""
-    python = VENV / "bin" / "python"
-    if not python.exists():
-        steps = (
-            [sys.executable, "-m", "venv", str(VENV)],
-            [str(VENV / "bin" / "pip"), "install", "-q", "toppra"],
-        )
-        if any(subprocess.run(step, check=False).returncode for step in steps):
-            return None
+def peer(job: dict) -> list | str:
+    """toppra's results, installed into an environment of its own; a sentence when it cannot be."""
+    python = environment("toppra", "toppra")
+    if isinstance(python, str):
+        return python
     script = Path(__file__).with_name("toppra_peer.py")
     done = subprocess.run(
         [str(python), str(script)], input=json.dumps(job), capture_output=True, text=True, check=False
     )
-    return json.loads(done.stdout) if done.returncode == 0 else None
+    return json.loads(done.stdout) if done.returncode == 0 else f"absent: {last_line(done.stderr)}"
 
 
 def retiming(console: Console) -> list[Figure]:
@@ -46,8 +40,7 @@ def retiming(console: Console) -> list[Figure]:
     try:
         model = load_model("wx250s")
     except ModelError:
-        console.print("retiming: no wx250s here (set PANTOGRAPH_DATA)")
-        return [Figure("retiming: wx250s present", 0.0, "", "present", False)]
+        return [absent("retiming", NO_ROBOT)]
     names = [model.joint(j).name for j in range(6)]
     rng, times = np.random.default_rng(0), np.linspace(0.0, SECONDS, KEYS)
     paths = rng.uniform(-0.9, 0.9, (PATHS, KEYS, 6))
@@ -65,8 +58,8 @@ def retiming(console: Console) -> list[Figure]:
     figures = [at_most("retiming: largest share of a limit, grid x 10", share - 1.0, 1e-6, "")]
     job = {"times": times.tolist(), "paths": paths.tolist(), "points": POINTS}
     theirs = peer(job | {"velocity": [SPEED] * 6, "acceleration": [BEND] * 6})
-    if theirs is None:
-        return [*figures, Figure("retiming: toppra present", 0.0, "", "present", False)]
+    if isinstance(theirs, str):
+        return [*figures, absent("retiming beside toppra", theirs)]
     for k, n in enumerate(POINTS):
         ours, other = (
             np.array(mine[n]),
@@ -76,11 +69,11 @@ def retiming(console: Console) -> list[Figure]:
         scale = max(r[k]["scale"] for r in theirs)
         figures += [
             at_most(f"retiming, {n} points: duration / toppra's, largest", ratio.max(), 1.0 + 1e-6, ""),
-            info(f"retiming, {n} points: duration / toppra's, median", float(np.median(ratio)), ""),
-            info(f"retiming, {n} points: toppra slowed by up to", scale, ""),
+            told(f"retiming, {n} points: duration / toppra's, median", float(np.median(ratio)), ""),
+            told(f"retiming, {n} points: toppra slowed by up to", scale, ""),
             at_most(f"retiming, {n} points: time / toppra's, median", float(np.median(speed)), 1.2, ""),
-            info(f"retiming, {n} points: time / toppra's, 90 %", float(np.percentile(speed, 90)), ""),
-            info(f"retiming, {n} points: our time", 1e3 * float(np.median(ours[:, 1])), "ms"),
+            told(f"retiming, {n} points: time / toppra's, 90 %", float(np.percentile(speed, 90)), ""),
+            told(f"retiming, {n} points: our time", 1e3 * float(np.median(ours[:, 1])), "ms"),
         ]
     return figures
 
@@ -90,7 +83,7 @@ def smooth(console: Console) -> list[Figure]:
     try:
         model = load_model("wx250s")
     except ModelError:
-        return [Figure("bounded jerk: wx250s present", 0.0, "", "present", False)]
+        return [absent("bounded jerk", NO_ROBOT)]
     names = [model.joint(j).name for j in range(6)]
     rng, times = np.random.default_rng(0), np.linspace(0.0, SECONDS, KEYS)
     limits = {"velocity": dict.fromkeys(names, SPEED), "acceleration": dict.fromkeys(names, BEND)}
@@ -107,8 +100,8 @@ def smooth(console: Console) -> list[Figure]:
         share = max(share, found.report.worst)
     return [
         at_most("bounded jerk: largest share of a limit, grid x 10", share - 1.0, 1e-6, ""),
-        info("bounded jerk: duration / that without, median", float(np.median(longer)), ""),
-        info("bounded jerk: our time, median", float(np.median(seconds)), "s"),
+        told("bounded jerk: duration / that without, median", float(np.median(longer)), ""),
+        told("bounded jerk: our time, median", float(np.median(seconds)), "s"),
     ]
 
 
@@ -131,7 +124,7 @@ def fitting(console: Console) -> list[Figure]:
             at_most(
                 f"{name}: simulated with the law in the loop, largest error", proof.worst, near, "rad, m"
             ),
-            info(f"{name}: time of the fit", seconds, "s"),
+            told(f"{name}: time of the fit", seconds, "s"),
         ]
     return figures
 

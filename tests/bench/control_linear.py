@@ -4,7 +4,7 @@ import time
 
 import casadi as ca
 import numpy as np
-from control_figures import Figure, at_most, info
+from figures import Figure, at_most, told
 from pantograph.controllers.basin import advance
 from pantograph.controllers.lqr import LQR
 from pantograph.controllers.predictive import linear as predictive
@@ -70,11 +70,11 @@ def linear(console: Console) -> list[Figure]:
     return [
         at_most("linear MPC without limits against LQR, relative", apart, 1e-9, ""),
         at_most(f"{name}: 99th percentile of a tick, processor time", 1e3 * late, 1e3 * PERIOD, "ms"),
-        info(f"{name}: median tick, processor time", 1e3 * float(np.median(ticks)), "ms"),
-        info(f"{name}: ticks that limits change", len(seen) / len(ticks), ""),
-        info(f"{name}: way of the cart, of its range", furthest / 0.4, ""),
+        told(f"{name}: median tick, processor time", 1e3 * float(np.median(ticks)), "ms"),
+        told(f"{name}: ticks that limits change", len(seen) / len(ticks), ""),
+        told(f"{name}: way of the cart, of its range", furthest / 0.4, ""),
         at_most(f"{name}: first force against DAQP, of the drive's", error, 1e-6, ""),
-        info(f"{name}: DAQP's time through CasADi / ours, median", float(np.median(ratios)), ""),
+        told(f"{name}: DAQP's time through CasADi / ours, median", float(np.median(ratios)), ""),
     ]
 
 

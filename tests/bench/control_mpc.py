@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from control_figures import Figure, at_least, at_most, info
+from figures import Figure, at_least, at_most, told
 from pantograph.controllers.basin import advance
 from pantograph.controllers.predictive.nonlinear import NMPC
 from pantograph.models import load_model
@@ -63,12 +63,12 @@ def run(console: Console, name: str, law: NMPC, x: np.ndarray, seconds: float) -
     late = float(np.percentile(ticks, 99))
     return [
         at_most(f"{name}: 99th percentile of a tick", 1e3 * late, 1e3 * period, "ms"),
-        info(f"{name}: median tick", 1e3 * float(np.median(ticks)), "ms"),
-        info(f"{name}: first tick, from nothing", 1e3 * first, "ms"),
+        told(f"{name}: median tick", 1e3 * float(np.median(ticks)), "ms"),
+        told(f"{name}: first tick, from nothing", 1e3 * first, "ms"),
         at_most(f"{name}: cost / converged optimum, largest", max(ratios), 1.01, ""),
-        info(f"{name}: cost / converged optimum, median", float(np.median(ratios)), ""),
+        told(f"{name}: cost / converged optimum, median", float(np.median(ratios)), ""),
         at_least(f"{name}: IPOPT's median time / ours", float(np.median(theirs) / np.median(ticks)), 1.0, ""),
-        info(
+        told(
             f"{name}: distance from the goal at the end",
             float(np.abs(x - law.horizon(seconds).x[0]).max()),
             "",

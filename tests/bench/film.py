@@ -5,11 +5,10 @@ does falls on all alike. CPU time counts all threads of the process; "lean" is m
 multisampling, shadows and reflections.
 """
 
-import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,6 +16,7 @@ os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = "egl"  # one GL for 
 
 import mujoco
 import numpy as np
+from figures import Figure, main, ratio, told
 from pantograph.sim.film import Camera, Renderer
 from pantograph.sim.film.drawing import drawn_geoms
 from pantograph.sim.film.shapes import geom_shape
@@ -165,13 +165,8 @@ def memory_growth(model: mujoco.MjModel, q: np.ndarray, camera: Camera) -> float
     return float(np.median(held[-50:]) - np.median(held[50:100]))
 
 
-def main() -> int:
-    figures: dict[str, dict[str, object]] = {}
-
-    def judge(name: str, value: float, bar: str, holds: bool | None) -> None:
-        figures[name] = {"value": round(value, 4), "bar": bar, "holds": holds}
-
-    found = models()
+def frames(console: Console) -> Iterator[Figure]:
+    """CPU time of a frame of every variant, and ratios to ours."""
     table = Table(
         title=f"CPU-ms a frame (1000 over it: frames a second and core) at {SIZE[0]}x{SIZE[1]}: "
         f"median (10 to 90 %), {ROUNDS} rounds in turn"
@@ -186,7 +181,7 @@ def main() -> int:
     )
     for column in ("model", *columns):
         table.add_column(column, justify="left" if column == "model" else "right")
-    for title, model in found.items():
+    for title, model in models().items():
         q = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         camera = Camera.auto(model, q[None])
         with ExitStack() as stack:
@@ -203,37 +198,25 @@ def main() -> int:
         for name in columns:
             low, middle, high = np.percentile(times[name], [10, 50, 90])
             cells.append(f"{middle:.0f} ({low:.0f}-{high:.0f})")
-            figures[f"{title}: {name}, CPU-ms"] = {
-                "value": round(float(middle), 1),
-                "bar": None,
-                "holds": None,
-            }
+            yield told(f"{title}: {name}", middle, "CPU-ms")
         table.add_row(title, *cells)
-
-        def ratio(slow: str, fast: str, times: dict[str, np.ndarray] = times) -> float:
-            return float(np.median(times[slow] / times[fast]))
-
         for slow, fast in ((columns[2], columns[0]), (columns[3], columns[1]), (columns[4], columns[0])):
-            value = ratio(slow, fast)
-            judge(f"{title}: {slow} / {fast}", value, "> 1", value > 1)
-        judge(f"{title}: {columns[5]} / {columns[1]}", ratio(columns[5], columns[1]), "none yet", None)
-
-    first = next(iter(found.values()))
-    growth = memory_growth(first, first.qpos0, Camera.auto(first, first.qpos0[None]))
-    judge(f"memory growth over {FRAMES} frames, MB", growth, f"< {FLAT:g}", growth < FLAT)
-
-    console = Console(width=150)
+            value, spread = ratio(times, slow, fast)
+            yield Figure(f"{title}: {slow} / {fast}", value, "x", "> 1", value > 1, spread)
+        value, spread = ratio(times, columns[5], columns[1])
+        yield told(f"{title}: {columns[5]} / {columns[1]}", value, "x", spread)
     console.print(table)
-    console.print(f"Memory grew by {growth:.2f} MB over {FRAMES} frames (bar {FLAT:g} MB).")
     console.print(
         "Ours and stock pyrender draw with 4 samples a pixel, as mujoco's default does; lean has one."
     )
-    for name, figure in figures.items():
-        if figure["bar"] is not None:
-            console.print(f"  {name}: {figure['value']}  (bar: {figure['bar']})", highlight=False)
-    print(json.dumps(figures), flush=True)
-    return 0 if all(figure["holds"] in (True, None) for figure in figures.values()) else 1
+
+
+def memory(console: Console) -> Iterator[Figure]:
+    model = next(iter(models().values()))
+    growth = memory_growth(model, model.qpos0, Camera.auto(model, model.qpos0[None]))
+    yield Figure(f"memory growth over {FRAMES} frames", growth, "MB", f"< {FLAT:g}", growth < FLAT)
 
 
 if __name__ == "__main__":
-    os._exit(main())  # stock pyrender's destructors fail, and print, when the interpreter winds down
+    # stock pyrender's destructors fail, and print, when the interpreter winds down
+    os._exit(main("film", {"frames": frames, "memory": memory}))

@@ -4,13 +4,11 @@
 verdicts, motion, loops.
 """
 
-import json
 import os
 import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -20,22 +18,20 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from arms import bare, panda, ur5  # noqa: E402
+from figures import at_least, at_most, environment, last_line, main, told  # noqa: E402
 from ik_clock import clocked, spin  # noqa: E402
-from ik_figures import at_least, at_most, told  # noqa: E402
 from ik_goals import several  # noqa: E402
 from oracles import ik_cases, ik_loops  # noqa: E402
 from oracles.ik_motions import figure_eight, walk, wrist_arm  # noqa: E402
 from pantograph.models import data_robots, load_model  # noqa: E402
 from pantograph.sim.ik import ChainSolver, Follower, Loops, follow, lock, solve  # noqa: E402
 from pantograph.sim.kinematics import frame  # noqa: E402
-from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 BUDGET = 5e-3  # [s], of the TRAC-IK protocol; of processor time, so that other work does not count
 TOLERANCE = 1e-5
 RANDOM_TARGETS, PEER_TARGETS, CASES = 10_000, 200, 1000
-ENVIRONMENT = HERE.parents[1] / ".bench" / "ik"
 PACKAGES = ("mink", "pin-pink", "daqp", "qpsolvers", "mujoco>=4")
 
 
@@ -128,39 +124,26 @@ def plain(model, R, p, budget):
     return seconds, met
 
 
-def peer(name, model, R, p, budget, folder):
-    """mink or pink in their own environment; None when they cannot be had."""
+def peer(python, name, model, R, p, budget, folder):
+    """Seconds and successes of mink or pink in their own environment; a sentence when it cannot be had."""
+    if isinstance(python, str):
+        return python
     path, targets, result = folder / "arm.xml", folder / "targets.npz", folder / f"{name}.npz"
     mujoco.mj_saveLastXML(str(path), model) if not path.is_file() else None
     np.savez(targets, R=R, p=p, tolerance=TOLERANCE)
-    command = [ENVIRONMENT / "bin" / "python", HERE / "peers" / "ik_peers.py", name, path, targets]
+    command = [python, HERE / "peers" / "ik_peers.py", name, path, targets]
     done = subprocess.run([*command, str(budget * 1e3), result], capture_output=True, text=True, check=False)
     if done.returncode:
-        return done.stderr.strip().splitlines()[-1] if done.stderr else "failed"
+        return f"absent: {last_line(done.stderr)}"
     data = np.load(result)
     return data["seconds"], data["met"]
-
-
-def environment():
-    """Make the peers' environment when it is not there; a reason why not, or None."""
-    if (ENVIRONMENT / ".done").is_file():
-        return None
-    subprocess.run([sys.executable, "-m", "venv", ENVIRONMENT], check=True)
-    done = subprocess.run(
-        [ENVIRONMENT / "bin" / "python", "-m", "pip", "install", "--quiet", *PACKAGES],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        return done.stderr.strip().splitlines()[-1]
-    (ENVIRONMENT / ".done").touch()
-    return None
 
 
 def protocol(console):
     """Success within the budget, mean and 99th percentile of time, ours and peers on the same targets."""
     import tempfile
 
-    absent = environment()
+    python = environment("ik", *PACKAGES)
     table = Table(
         title=f"TRAC-IK protocol: {TOLERANCE:g} in every component, from mid-range, {BUDGET * 1e3:g} ms"
     )
@@ -201,14 +184,11 @@ def protocol(console):
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "arm.xml").write_text(model_xml(model))
             for solver in ("mink", "pink"):
-                if absent:
-                    rows.append((solver, f"absent: {absent}", None))
-                    continue
-                quick = peer(solver, model, R[few], p[few], BUDGET, Path(folder))
+                quick = peer(python, solver, model, R[few], p[few], BUDGET, Path(folder))
                 slow = (
                     quick
                     if isinstance(quick, str)
-                    else peer(solver, model, R[few], p[few], 0.1, Path(folder))
+                    else peer(python, solver, model, R[few], p[few], 0.1, Path(folder))
                 )
                 rows.append(
                     (
@@ -376,27 +356,11 @@ def loops(console):
 
 def goals(console):
     """Several goals at once beside mink."""
-    return several(console, ENVIRONMENT, environment())
+    return several(console, environment("ik", *PACKAGES))
 
 
 PARTS = {"motion": motion, "loops": loops, "goals": goals, "protocol": protocol, "verdicts": verdicts}
 
 
-def main():
-    console = Console()
-    chosen = sys.argv[1:] or list(PARTS)
-    figures = [figure for part in chosen for figure in PARTS[part](console)]
-    table = Table(title="Figures")
-    for column in ("figure", "value", "unit", "bar", "holds"):
-        table.add_column(column)
-    for f in figures:
-        table.add_row(
-            f.name, f"{f.value:.6g}", f.unit, f.bar, "" if f.holds is None else "yes" if f.holds else "NO"
-        )
-    console.print(table)
-    print(json.dumps({f.name: asdict(f) for f in figures}))
-    sys.exit(0 if all(f.holds is not False for f in figures) else 1)
-
-
 if __name__ == "__main__":
-    main()
+    sys.exit(main("ik", PARTS))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from ik_figures import at_least, told
+from figures import at_least, last_line, told
 from pantograph.models import load_model
 from pantograph.models.library import find
 from pantograph.sim.ik import CenterOfMass, Pose, Position, solve
@@ -93,23 +93,23 @@ def away(model, q):
     return np.array(out)
 
 
-def mink(environment, model_name, model, points, poses, p, X, c):
+def mink(python, model_name, model, points, poses, p, X, c):
     """mink's seconds, whether met, and answers; or a reason why not."""
     with tempfile.TemporaryDirectory() as folder:
         ask, answer = Path(folder) / "ask.npz", Path(folder) / "answer.npz"
         np.savez(ask, points=points, poses=poses, p=p, X=X, com=c, start=model.qpos0, tolerance=TOLERANCE)
         script = HERE / "peers" / "ik_goals.py"
-        command = [environment / "bin" / "python", script, find(model_name), ask, "0.5", answer]
+        command = [python, script, find(model_name), ask, "0.5", answer]
         done = subprocess.run(
             command, capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}
         )
         if done.returncode:
-            return done.stderr.strip().splitlines()[-1]
+            return f"absent: {last_line(done.stderr)}"
         data = np.load(answer)
         return data["seconds"], data["met"], data["q"]
 
 
-def several(console, environment, absent):
+def several(console, python):
     """Success, time and distance from the start: ours with and without machine code, and mink's."""
     table = Table(
         title=f"Several goals at once: {TOLERANCE:g} in every component, from the model's reference"
@@ -128,7 +128,7 @@ def several(console, environment, absent):
                 break
             solve(model, questions[0])
         quick = timed(model, questions)
-        other = f"absent: {absent}" if absent else mink(environment, model_name, model, points, poses, *aims)
+        other = python if isinstance(python, str) else mink(python, model_name, model, points, poses, *aims)
         for solver, answer in (("Pantograph", quick), ("Pantograph, NumPy alone", slow), ("mink", other)):
             row = [name if solver == "Pantograph" else "", solver]
             if isinstance(answer, str):

@@ -6,16 +6,15 @@ cannot be compiled: user functions, events, Python controllers.
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from figures import Figure, absent, at_least, main
 from rich.console import Console
-from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from oracles import pendulum
@@ -90,41 +89,20 @@ def duel(case, method: str, peer: str) -> tuple[list[float], list[float], list[f
     return ratios, work, times
 
 
-def main() -> int:
-    table = Table(title="CPU time to errors of 1e-5 to 1e-10: peer over ours, geometric mean of all targets")
-    for heading in (
-        "case",
-        "method",
-        "peer",
-        "CPU ratio",
-        "spread over targets",
-        "evaluations ratio",
-        "CPU [ms]",
-    ):
-        table.add_column(heading)
-    figures = []
+def duels(console: Console) -> Iterator[Figure]:
+    """Peer's CPU time over ours: geometric mean over the targets that both reach."""
     for name, case in cases().items():
         for method, peer in RIVALS.items():
+            title = f"{name}: CPU time of {peer} over {method}"
             ratios, work, times = duel(case, method, peer)
-            ratio = statistics.geometric_mean(ratios)
-            spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
-            effort = statistics.geometric_mean(work)
-            cost = f"{1e3 * times[0]:.3g} to {1e3 * times[-1]:.3g}"
-            table.add_row(name, method, peer, f"{ratio:.2f}", spread, f"{effort:.2f}", cost)
-            figures.append(
-                {
-                    "figure": f"{name}: CPU time of {peer} over {method}, mean of {len(ratios)} errors",
-                    "value": round(ratio, 3),
-                    "evaluations_ratio": round(effort, 3),
-                    "bar": BAR,
-                    "holds": ratio >= BAR and len(ratios) == len(TARGETS),
-                }
-            )
-    Console(width=150).print(table)
-    holds = all(figure["holds"] for figure in figures)
-    print(json.dumps({"bench": "integrators", "figures": figures, "holds": holds}))
-    return 0 if holds else 1
+            if len(ratios) < len(TARGETS):
+                yield absent(title, f"{len(ratios)} of {len(TARGETS)} errors reached")
+                continue
+            detail = f"mean of errors {TARGETS[0]:g} to {TARGETS[-1]:g}, ratios {min(ratios):.2f} to "
+            detail += f"{max(ratios):.2f}; evaluations {statistics.geometric_mean(work):.2f} times ours; "
+            detail += f"ours {1e3 * times[0]:.3g} to {1e3 * times[-1]:.3g} ms"
+            yield at_least(title, statistics.geometric_mean(ratios), BAR, "x", detail)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main("integrators", {"duels": duels}))

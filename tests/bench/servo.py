@@ -3,38 +3,23 @@
 A part is a function that returns figures; the last line is one JSON object of all of them.
 """
 
-import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
 from random import Random
 
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler
+from figures import Figure, at_most, main
 from pantograph.hardware import packets as p
 from pantograph.hardware.virtual import MemoryPort, Timing, VirtualBus, VirtualServo
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from servo_mirror import cpu_cost, driver_wire_time, losses, real_time
 
 GOAL, PRESENT = 116, 132
 FUZZ_BYTES = 1_000_000
 SDK = PacketHandler(2.0)
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One measured number and the bar it must reach."""
-
-    name: str
-    value: float
-    unit: str
-    bar: str
-    holds: bool
-
-
-def at_most(name: str, value: float, bar: float, unit: str) -> Figure:
-    return Figure(name, value, unit, f"<= {bar:g}", value <= bar)
 
 
 # Wire time.
@@ -221,23 +206,10 @@ def fuzz_bus(console: Console) -> list[Figure]:
     ]
 
 
-PARTS: tuple[Callable[[Console], list[Figure]], ...] = (wire_time, fuzz_parser, fuzz_bus)
-
-
-def main() -> int:
-    from servo_mirror import PARTS as MIRROR  # which takes Figure from here
-
-    console = Console()
-    figures = [figure for part in (*PARTS, *MIRROR) for figure in part(console)]
-    table = Table(title="Servo bus")
-    for name in ("figure", "value", "unit", "bar", "holds"):
-        table.add_column(name)
-    for f in figures:
-        table.add_row(f.name, f"{f.value:.4g}", f.unit, f.bar, "yes" if f.holds else "[red]NO[/red]")
-    console.print(table)
-    print(json.dumps({"bench": "servo", "figures": [asdict(f) for f in figures]}))
-    return 0 if all(f.holds for f in figures) else 1
-
+PARTS = {
+    part.__name__: part
+    for part in (wire_time, fuzz_parser, fuzz_bus, driver_wire_time, cpu_cost, losses, real_time)
+}
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main("servo", PARTS))

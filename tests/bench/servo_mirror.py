@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from dynamixel_sdk import PacketHandler
+from figures import Figure, at_most
 from pantograph.hardware.connect import connect
 from pantograph.hardware.mirror import Session
 from pantograph.hardware.mirror.contract import prepare
@@ -23,7 +24,6 @@ from pantograph.hardware.virtual_rig import virtual_bus
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from servo import Figure, at_most
 
 SERVOS = 12
 MINUTES = 10.0
@@ -336,6 +336,3 @@ def real_time(console: Console) -> list[Figure]:
         at_most("real time: jitter, 99th percentile", 1e3 * float(np.quantile(jitter, 0.99)), 5.0, "ms"),
         at_most("real time: jitter, median", 1e3 * float(np.median(jitter)), 0.5, "ms"),
     ]
-
-
-PARTS = (driver_wire_time, cpu_cost, losses, real_time)

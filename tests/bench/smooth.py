@@ -11,20 +11,18 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import smooth_models as models
 import smooth_peers as peers
+from figures import absent, at_least, at_most, main, ratio
 from mujoco.rollout import rollout
 from pantograph.sim.compile.program import workers
 from pantograph.sim.dynamics import compile_model, unsupported
 from pantograph.sim.integrate import TABLEAUS
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 FIVE = ("double_pendulum", "ur5", "panda", "quadruped", "humanoid")
 ROLLOUT_BARS = {  # one state, batch of 4096: steps per second and core over mujoco.rollout's
@@ -40,29 +38,6 @@ STEPS = FRAMES * np.unique(np.round(2.0 ** np.arange(1.0, 13.01, 0.25)).astype(i
 DERIVATIVE_BARS = {"ur5": 8, "panda": 3, "quadruped": 2.5, "humanoid": 1}
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One measured number, the bar it must reach, and what was measured."""
-
-    name: str
-    value: float | None
-    bar: str
-    holds: bool
-    detail: str = ""
-
-
-def at_least(name, value, bar, detail=""):
-    return Figure(name, round(float(value), 2), f">= {bar:g}", bool(value >= bar), detail)
-
-
-def at_most(name, value, bar, detail=""):
-    return Figure(name, float(f"{value:.3g}"), f"<= {bar:g}", bool(value <= bar), detail)
-
-
-def absent(name, why):
-    return Figure(name, None, "present", False, why)
-
-
 def alternating(calls: dict[str, Callable[[], None]], rounds: int = 9, clock=time.process_time):
     """Seconds of each call, rounds taken in turn: {name: array}."""
     for call in calls.values():
@@ -76,16 +51,10 @@ def alternating(calls: dict[str, Callable[[], None]], rounds: int = 9, clock=tim
     return {name: np.array(values) for name, values in out.items()}
 
 
-def ratio(times, slow, fast):
-    """Median ratio and its spread in words."""
-    r = times[slow] / times[fast]
-    return float(np.median(r)), f"{np.quantile(r, 0.25):.3g}-{np.quantile(r, 0.75):.3g}"
-
-
 # ---- agreement
 
 
-def agreement():
+def agreement(console):
     names = [p.stem for p in sorted(models.MJCF.glob("*.xml"))]
     names += [*models.ROBOTS, "ur5", "panda", "chain of 40 hinges", "chain of ball joints"]
     for name in track(names, "agreement with MuJoCo"):
@@ -105,10 +74,10 @@ def agreement():
             data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = q[i], v[i], act[i], u[i]
             mujoco.mj_forward(model, data)
             worst = max(worst, np.abs(a[i] - data.qacc).max() / max(np.abs(data.qacc).max(), 1e-9))
-        yield at_most(title, worst, 1e-10, f"1000 states, {smooth.stats.operations} operations")
+        yield at_most(title, worst, 1e-10, "", f"1000 states, {smooth.stats.operations} operations")
 
 
-def lanes():
+def lanes(console):
     for name in FIVE:
         model = models.load(name)
         if model is None:
@@ -127,7 +96,7 @@ def lanes():
 # ---- speed
 
 
-def rollouts():
+def rollouts(console):
     for name in FIVE:
         source = models.load(name)
         if source is None:
@@ -156,10 +125,10 @@ def rollouts():
             r, spread = ratio(times, "mujoco", "smooth")
             rate = 1e-6 / np.median(times["smooth"])
             detail = f"{rate:.3g} million steps/s, spread {spread}"
-            yield at_least(f"RK4 steps over mujoco.rollout, {name}, {count}", r, bar, detail)
+            yield at_least(f"RK4 steps over mujoco.rollout, {name}, {count}", r, bar, "x", detail)
 
 
-def two_cores():
+def two_cores(console):
     if workers() < 2:
         yield absent("two cores", "one core here")
         return
@@ -173,7 +142,7 @@ def two_cores():
     best = times["1"].min() / times["2"].min()
     _, spread = ratio(times, "1", "2")
     yield at_least(
-        "two cores over one, quadruped, 4096", best, 1.8, f"wall time, best of 15; spread {spread}"
+        "two cores over one, quadruped, 4096", best, 1.8, "x", f"wall time, best of 15; spread {spread}"
     )
 
 
@@ -193,7 +162,7 @@ def _on_states(smooth, name, **arrays):
     return call
 
 
-def pinocchio():
+def pinocchio(console):
     binary = peers.program()
     if isinstance(binary, str):
         yield absent("Pinocchio", binary)
@@ -224,19 +193,21 @@ def pinocchio():
         worst = np.abs(one.forward(q, v, tau=tau) - a).max() / np.abs(a).max()
         yield at_most(f"qacc against Pinocchio, {name}", worst, 1e-10)
         seen = f"Pinocchio's ABA {aba:.0f} ns, one lane {ns['forward 1']:.0f}, lanes {ns['forward']:.0f}"
-        yield at_least(f"forward dynamics over Pinocchio, {name}", aba / ns["forward 1"], 1, seen)
+        yield at_least(f"forward dynamics over Pinocchio, {name}", aba / ns["forward 1"], 1, "x", seen)
         if name in DERIVATIVE_BARS:
             seen = f"Pinocchio {derivatives / 1e3:.2f} us, one lane {ns['derivatives 1'] / 1e3:.2f} us"
             r = derivatives / ns["derivatives 1"]
-            yield at_least(f"derivatives over Pinocchio, {name}, one state", r, DERIVATIVE_BARS[name], seen)
+            yield at_least(
+                f"derivatives over Pinocchio, {name}, one state", r, DERIVATIVE_BARS[name], "x", seen
+            )
             r, seen = derivatives / ns["derivatives"], f"{ns['derivatives'] / 1e3:.2f} us"
-            yield at_least(f"derivatives over Pinocchio, {name}, batch", r, 4, seen)
+            yield at_least(f"derivatives over Pinocchio, {name}, batch", r, 4, "x", seen)
         if name == "humanoid":
             r, seen = derivatives / ns["vjp 1"], f"one lane {ns['vjp 1'] / 1e3:.2f} us"
-            yield at_least("vector-Jacobian product over Pinocchio's derivatives, humanoid", r, 5, seen)
+            yield at_least("vector-Jacobian product over Pinocchio's derivatives, humanoid", r, 5, "x", seen)
 
 
-def drake():
+def drake(console):
     python = peers.drake_python()
     if isinstance(python, str):
         yield absent("Drake", python)
@@ -267,13 +238,13 @@ def drake():
         seen = f"Drake's evaluation {theirs:.0f} ns (before ours {before[0]:.0f}, after {after[0]:.0f}), its "
         seen += f"Python calls of {off:.0f} ns measured on cached answers and taken off; "
         seen += f"one lane {ns['one']:.0f}, lanes {ns['batch']:.0f}"
-        yield at_least(f"forward dynamics over Drake, {name}", theirs / ns["one"], 1, seen)
+        yield at_least(f"forward dynamics over Drake, {name}", theirs / ns["one"], 1, "x", seen)
 
 
 # ---- accuracy for its price
 
 
-def to_an_error():
+def to_an_error(console):
     """CPU time to a maximal error over the trajectory, against MuJoCo's integrators at their best steps."""
     for name, bars in (("double_pendulum", {1e-6: 80}), ("ur5", {1e-6: 30, 1e-9: 40})):
         model = models.stripped(models.load(name))
@@ -291,7 +262,7 @@ def to_an_error():
             fast, fast_by = _cheapest(ours, tolerance)
             detail = f"{slow_by} {slow * 1e3:.3g} ms, {fast_by} {fast * 1e6:.3g} us, "
             detail += f"reference uncertain by {np.abs(check - exact).max():.1e}"
-            yield at_least(f"CPU time to an error of {tolerance:g}, {name}", slow / fast, bar, detail)
+            yield at_least(f"CPU time to an error of {tolerance:g}, {name}", slow / fast, bar, "x", detail)
 
 
 def _cheapest(costs, tolerance):
@@ -385,7 +356,7 @@ print(json.dumps([imported, one, clock() - begin]))
 """
 
 
-def first_use():
+def first_use(console):
     here = str(Path(__file__).parent)
     for name, bar in (("ur5", 0.5), ("humanoid", 3.0)):
         if models.load(name) is None:
@@ -404,9 +375,9 @@ def first_use():
                     runs[kind].append(json.loads(out.stdout))
         first, second = (np.median(runs[kind], axis=0) for kind in ("first", "second"))
         detail = f"one forward dynamics after {first[1]:.2g} s; imports {first[0]:.2g} s beside"
-        yield at_most(f"first use: a function and a batch's rollout, {name} [CPU s]", first[2], bar, detail)
+        yield at_most(f"first use: a function and a batch's rollout, {name}", first[2], bar, "CPU s", detail)
         seen = f"{second[2] * 1e3:.1f} ms"
-        yield at_least(f"second use quicker, {name}", first[2] / second[2], 10, seen)
+        yield at_least(f"second use quicker, {name}", first[2] / second[2], 10, "x", seen)
 
 
 PARTS = {
@@ -421,23 +392,5 @@ PARTS = {
 }
 
 
-def main() -> int:
-    console = Console()
-    figures: list[Figure] = []
-    for name in sys.argv[1:] or PARTS:
-        for figure in PARTS[name]():
-            figures.append(figure)
-    table = Table(title="smooth engine")
-    for column in ("figure", "value", "bar", "holds", "detail"):
-        table.add_column(column, overflow="fold")
-    for f in figures:
-        value = "absent" if f.value is None else f"{f.value:g}"
-        table.add_row(f.name, value, f.bar, "yes" if f.holds else "[bold red]no[/]", f.detail)
-    console.print(table)
-    good = all(f.holds for f in figures)
-    print(json.dumps({"bench": "smooth", "holds": good, "figures": [asdict(f) for f in figures]}))
-    return 0 if good else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main("smooth", PARTS))

@@ -2,30 +2,16 @@
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from figures import ENVIRONMENTS, environment, last_line
 
-ROOT = Path(__file__).parents[2]
-VENV = ROOT / ".bench" / "pinocchio"
-DRAKE = ROOT / ".bench" / "drake"
+VENV, DRAKE = ENVIRONMENTS / "pinocchio", ENVIRONMENTS / "drake"
 SOURCE = Path(__file__).parent / "peers" / "pinocchio.cpp"
 FLAGS = "-std=c++17 -O3 -march=native -DNDEBUG"
 FLAGS += " -DBOOST_MPL_LIMIT_LIST_SIZE=30 -DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"  # as its CMake files
-
-
-def _missing(folder, package):
-    """Make the environment with its package unless it is there; a sentence when that fails."""
-    if folder.exists():
-        return None
-    pip = [folder / "bin" / "python", "-m", "pip", "install", "-q", package]
-    for command in ([sys.executable, "-m", "venv", folder], pip):
-        if subprocess.run(command, capture_output=True).returncode:
-            shutil.rmtree(folder, ignore_errors=True)
-            return f"absent: `pip install {package}` failed"
-    return None
 
 
 def program():
@@ -35,8 +21,8 @@ def program():
         return binary
     if shutil.which("g++") is None:
         return "absent: timing Pinocchio without Python takes a C++ compiler (g++), which is not here"
-    if why := _missing(VENV, "pin"):
-        return why
+    if isinstance(python := environment("pinocchio", "pin"), str):
+        return python
     prefix = next(VENV.glob("lib/python*/site-packages/cmeel.prefix"), None)
     import casadi
 
@@ -150,22 +136,12 @@ def pinocchio(binary, model, q, v, tau):
 
 
 def drake_python():
-    """The Python that has Drake; a sentence saying why not when it cannot be had."""
-    if why := _missing(DRAKE, "drake"):
-        return why
-    python = DRAKE / "bin" / "python"
-    try:
-        command = [python, "-c", "import pydrake.multibody.plant"]
-        subprocess.run(command, capture_output=True, text=True, check=True)
-    except subprocess.CalledProcessError as error:
-        return f"absent: {_last_line(error.stderr)}"
-    except OSError as error:
-        return f"absent: {error}"
-    return python
-
-
-def _last_line(text):
-    return (text.strip().splitlines() or ["it ended without a word"])[-1][:200]
+    """The Python that has Drake; a sentence saying why not when it cannot be had or does not start."""
+    if isinstance(python := environment("drake", "drake"), str):
+        return python
+    command = [python, "-c", "import pydrake.multibody.plant"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return f"absent: {last_line(done.stderr)}" if done.returncode else python
 
 
 def _mjcf(model):
@@ -213,7 +189,7 @@ def drake(python, model, q, v, tau):
     command = [python, SOURCE.parent / "drake_aba.py", path, given, result]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        return f"absent: {_last_line(done.stderr)}"
+        return f"absent: {last_line(done.stderr)}"
     got = np.load(result)
     a = got["a"].copy()
     for j in free:
