@@ -10,8 +10,8 @@ from oracles import control_qp
 from pantograph.controllers.basin import advance
 from pantograph.controllers.design import dlqr
 from pantograph.controllers.lqr import LQR
-from pantograph.controllers.predictive.least import NOTHING, Held, least_change
 from pantograph.controllers.predictive.linear import MPC, _moves
+from pantograph.controllers.predictive.quadratic import LeastChange
 from pantograph.models import load_model
 from pantograph.sim import PantographError, Scene, make_plan, run
 from pantograph.sim.clip import Clip
@@ -132,21 +132,27 @@ def test_the_least_change_is_that_of_lawson_and_hanson(seed, n, r):
     low, high = inside - rng.uniform(0.01, 0.5, r), inside + rng.uniform(0.01, 0.5, r)
     low, high = np.where(rng.uniform(size=(2, r)) < 0.2, [[-np.inf], [np.inf]], [low, high])
     give = np.where(rng.uniform(size=r) < 0.3, rng.uniform(0.1, 1, r), 0.0)
+    least_change = LeastChange()
     z, held, _ = least_change(M, low, high, give)
     expected = by_nonnegative_least_squares(M, np.maximum(low, -1e3), np.minimum(high, 1e3), give)
     np.testing.assert_allclose(z, expected, atol=1e-6 * (1 + np.abs(z).max()))
     guess = rng.permutation(r)[: rng.integers(0, r + 1)]
-    warm, _, _ = least_change(M, low, high, give, Held(guess, rng.choice([-1.0, 1.0], len(guess))))
+    warm, _, _ = least_change(M, low, high, give, guess)
     np.testing.assert_allclose(warm, z, atol=1e-7 * (1 + np.abs(z).max()))
-    _, again, steps = least_change(M, low, high, give, held)
-    assert steps == 0
-    np.testing.assert_array_equal(again.rows, held.rows)
+    again, same, programs = least_change(M, low, high, give, held)
+    assert programs == (1 if len(held) else 0)
+    assert set(same) <= set(held)
+    np.testing.assert_allclose(again, z, atol=1e-9 * (1 + np.abs(z).max()))
 
 
-def test_limits_that_contradict_each_other_are_told():
-    M, none = np.array([[1.0], [1.0]]), np.zeros(2)
+def test_hard_limits_that_contradict_each_other_are_told_and_soft_ones_give():
+    M, low, high = np.array([[1.0], [1.0]]), np.array([1.0, -2.0]), np.array([2.0, -1.0])
     with pytest.raises(PantographError, match="contradict"):
-        least_change(M, np.array([1.0, -2.0]), np.array([2.0, -1.0]), none, NOTHING)
+        LeastChange()(M, low, high, np.zeros(2))
+    z, held, _ = LeastChange()(M, low, high, np.array([0.01, 0.02]))
+    # z^2 + (1 - z)^2 / 0.01 + (1 + z)^2 / 0.02 is least where z + 100 (z - 1) + 50 (z + 1) = 0
+    assert z[0] == pytest.approx(50 / 151, rel=1e-9)
+    assert set(held) == {0, 1}
 
 
 @given(st.floats(1e-3, 3.0), st.sampled_from([1e-3, 0.01, 0.02]), st.integers(1, 30))

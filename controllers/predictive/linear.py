@@ -19,7 +19,7 @@ from ...sim.clip import Clip
 from ...sim.control import Target
 from ..gains import Gain, force_limits, per_joint, positive
 from ..lqr import LQR
-from .least import NOTHING, Held, least_change
+from .quadratic import NOTHING, LeastChange, Rows
 
 Array = NDArray[np.float64]
 _REPEATS = 4  # moves of each length beyond the fine ones
@@ -46,10 +46,10 @@ class Ahead(NamedTuple):
 
 
 class MPCMemory(NamedTuple):
-    """Last forces of the inputs (m,), None before the first; and the limits that held then."""
+    """Last forces of the inputs (m,), None before the first; and the rows of limits that held then."""
 
     u: Array | None
-    held: Held
+    held: Rows
 
 
 class MPC:
@@ -100,6 +100,7 @@ class MPC:
         self.x_high = np.concatenate([np.where(limited, ranges[:, 1], np.inf)[self.moving], top[self.moving]])
         self.limited = np.flatnonzero(np.isfinite(self.x_high - self.x_low))
         self.soft = positive("the MPC's soft", soft) * float(self.lqr.Q.max())
+        self.least_change = LeastChange()
         self._known: dict[bool, tuple[Array, Array, Array]] = {}
 
     @cached_property
@@ -142,7 +143,7 @@ class MPC:
         u, held = ahead.u[0], NOTHING
         if (at < low - 1e-12 * (1.0 + abs(low))).any() or (at > high + 1e-12 * (1.0 + abs(high))).any():
             M, give, scale = self.program(ahead, first=memory.u is None)
-            z, held, _ = least_change(M, low - at, high - at, give, memory.held)
+            z, held, _ = self.least_change(M, low - at, high - at, give, memory.held)
             u = np.clip(u + scale @ z[: len(u)], *self._now(memory.u))
         tau = np.zeros(self.model.nv)
         tau[self.inputs] = u
