@@ -36,15 +36,17 @@ class Daqp:
         shape = {"h": ca.Sparsity.diag(size), "a": ca.Sparsity.dense(size, size)}
         exact = {"primal_tol": 0.1 * _EXACT, "iter_limit": 100 * size}
         program = ca.conic("least_change", "daqp", shape, {"error_on_fail": False, "daqp": exact})
-        self._buffer, self._solve = program.buffer()
+        buffer: Any
+        buffer, self._solve = program.buffer()
+        self._buffer = buffer
         given: dict[str, Array] = {}
         for i, name in enumerate(program.name_in()):
             if name in ("h", "a", "lba", "uba", "lbx", "ubx"):
                 given[name] = np.zeros(program.nnz_in(i))
-                self._buffer.set_arg(i, memoryview(given[name]))
+                buffer.set_arg(i, given[name].data)
         self._y, self._pushes = np.zeros(size), np.zeros(size)
         for out, into in (("x", self._y), ("lam_a", self._pushes)):
-            self._buffer.set_res(program.name_out().index(out), memoryview(into))
+            buffer.set_res(program.name_out().index(out), into.data)
         given["h"][:], given["lbx"][:], given["ubx"][:] = 1.0, -np.inf, np.inf
         self._kept = given  # the program reads these arrays where they lie
         self._low, self._high = given["lba"], given["uba"]
