@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from .easings import EASINGS, evaluate_pieces
 from .errors import KeyingError, unknown
@@ -197,10 +197,10 @@ def keyed(
     elif kind == "linear":
         knots, coefficients = eased_pieces(t, q[:-1], np.diff(q, axis=0), ease)
     elif kind == "auto":
-        coefficients = CubicHermiteSpline(t, q, _monotone_slopes(t, q, loops)).c
+        coefficients = scipy.interpolate.CubicHermiteSpline(t, q, _monotone_slopes(t, q, loops)).c
     else:
         end_condition = "periodic" if loops and kind == "natural" else kind
-        coefficients = CubicSpline(t, q, bc_type=end_condition).c
+        coefficients = scipy.interpolate.CubicSpline(t, q, bc_type=end_condition).c
     return PolynomialCurve(frozen(t), frozen(q), frozen(knots), before, after, frozen(coefficients))
 
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from .curves import (
     Array,
@@ -215,7 +214,7 @@ def _blocks(entries: list[tuple[NDArray[np.intp], NDArray[np.intp], Array]], k: 
     row = np.concatenate([np.repeat(3 * r[:, None] + np.arange(3), 3, axis=1).ravel() for r, _, _ in entries])
     col = np.concatenate([np.tile(3 * c[:, None] + np.arange(3), 3).ravel() for _, c, _ in entries])
     values = np.concatenate([block.ravel() for _, _, block in entries])
-    return csc_array((values, (row, col)), shape=(3 * k, 3 * k))
+    return scipy.sparse.csc_array((values, (row, col)), shape=(3 * k, 3 * k))
 
 
 _Residual = Callable[[Array, float], Array]
@@ -250,7 +249,7 @@ def _newton(
         if np.linalg.norm(r) <= _TIGHT * scale:
             return w
         dw = np.zeros_like(w)
-        dw[free] = splu(jacobian(w, share)).solve(-r[free])
+        dw[free] = scipy.sparse.linalg.splu(jacobian(w, share)).solve(-r[free])
         step, trial = 1.0, residual(w + dw, share)
         while np.linalg.norm(trial) > (1 - 0.1 * step) * np.linalg.norm(r) and step > 0.01:
             step /= 2

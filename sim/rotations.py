@@ -8,8 +8,8 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from .errors import KeyingError
 
@@ -87,7 +87,9 @@ def to_matrix(q: ArrayLike) -> Array:
 def from_matrix(R: ArrayLike) -> Array:
     """Quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); the nearest if not orthogonal."""
     R = np.asarray(R, dtype=float)
-    q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True, scalar_first=True)
+    q = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(
+        canonical=True, scalar_first=True
+    )
     return np.asarray(q).reshape(*R.shape[:-2], 4)
 
 
@@ -99,7 +101,9 @@ def from_euler(seq: str, angles: ArrayLike) -> Array:
             f"Euler angles {seq!r} are {len(seq)} numbers, not an array of shape {angles.shape}"
         )
     try:
-        q = Rotation.from_euler(seq, angles.reshape(-1, len(seq))).as_quat(scalar_first=True)
+        q = scipy.spatial.transform.Rotation.from_euler(seq, angles.reshape(-1, len(seq))).as_quat(
+            scalar_first=True
+        )
     except ValueError as error:
         raise KeyingError(f"Euler sequence {seq!r}: {error}") from None
     return np.asarray(q).reshape(*angles.shape[:-1], 4)

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from ...models.naming import name_of
 from ..clip import Clip, FreeTrack, Track
@@ -48,7 +48,7 @@ def curve_clip(model: mujoco.MjModel, t: Array, q: Array, v: Array, joints: Sequ
     """C1 cubics through q (k, nq) with velocities v (k, nv) at times t (k,), of `joints` by id."""
 
     def numbers(at: slice, dof: slice) -> PolynomialCurve:
-        pieces = CubicHermiteSpline(t, q[:, at], v[:, dof]).c
+        pieces = scipy.interpolate.CubicHermiteSpline(t, q[:, at], v[:, dof]).c
         return PolynomialCurve(t, q[:, at], t, "hold", "hold", pieces)
 
     def turns(at: slice, dof: slice) -> RotationCurve:

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+import scipy
 
 from .steps import Step
 from .tableau import EPS, Array
@@ -88,7 +88,9 @@ def _crossings(event: Event, side: float, step: Step) -> tuple[list[float], floa
         side, start = _departure(event, step, resolution)
     knots = [start]
     if side * end > 0 and _dips(event, side, step):
-        bottom = minimize_scalar(lambda theta: side * g(theta), bounds=(0.0, 1.0), method="bounded").x
+        bottom = scipy.optimize.minimize_scalar(
+            lambda theta: side * g(theta), bounds=(0.0, 1.0), method="bounded"
+        ).x
         if side * g(float(bottom)) < 0:
             knots.append(float(bottom))
     knots.append(1.0)
@@ -98,7 +100,9 @@ def _crossings(event: Event, side: float, step: Step) -> tuple[list[float], floa
             continue
         if event.direction in (0, -side):
             crossed = side * g(a) <= 0  # by the rounding of a root at the end of the step before
-            roots.append(a if crossed else float(brentq(g, a, b, xtol=resolution, rtol=4 * EPS)))
+            roots.append(
+                a if crossed else float(scipy.optimize.brentq(g, a, b, xtol=resolution, rtol=4 * EPS))
+            )
         side = -side
     return roots, side
 

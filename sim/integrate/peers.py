@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
+import scipy
 
 from ..errors import EngineError, unknown
 from .control import fixed_grid, tolerances
@@ -77,7 +77,7 @@ def _scipy(
     f = Counted(problem.f)
     began = time.perf_counter()
     rtol, atol = tolerance
-    result = solve_ivp(
+    result = scipy.integrate.solve_ivp(
         f, span, y0, method=name, rtol=rtol, atol=atol, dense_output=times is not None or dense,
         events=[_scipy_event(event) for event in events],
     )  # fmt: skip

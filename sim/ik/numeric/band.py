@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from ..space import Space
 
@@ -127,7 +127,7 @@ class _Banded:
         bands, more = self.bands, 0.0
         for _ in range(8):
             try:
-                return np.asarray(cholesky_banded(bands, lower=True, check_finite=False))
+                return np.asarray(scipy.linalg.cholesky_banded(bands, lower=True, check_finite=False))
             except np.linalg.LinAlgError:
                 more = max(10 * more, 1e-12 * float(bands[0].max()))
                 bands = self.bands.copy()
@@ -233,7 +233,9 @@ class _Newton(NamedTuple):
         right = -self.stationary
         for w, si, zi, gap, t in zip(self.walls, self.s, self.z, self.gaps, targets, strict=True):
             right = right - w.back((t + zi * gap) / si - zi, self.shape[0])
-        dx = cho_solve_banded((self.factor, True), right.ravel(), check_finite=False).reshape(self.shape)
+        dx = scipy.linalg.cho_solve_banded((self.factor, True), right.ravel(), check_finite=False).reshape(
+            self.shape
+        )
         ds = [np.where(w.on, -gap - w.of(dx), 0.0) for w, gap in zip(self.walls, self.gaps, strict=True)]
         dz = [(t - zi * d) / si - zi for t, zi, d, si in zip(targets, self.z, ds, self.s, strict=True)]
         return dx, ds, [np.where(w.on, d, 0.0) for w, d in zip(self.walls, dz, strict=True)]
