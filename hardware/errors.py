@@ -2,7 +2,7 @@
 
 from ..models.errors import PantographError, unknown
 
-__all__ = ["BusError", "HardwareError", "PantographError", "RegisterError", "unknown"]
+__all__ = ["BusError", "HardwareError", "PantographError", "RegisterError", "SourceFault", "unknown"]
 
 
 class HardwareError(PantographError):
@@ -15,3 +15,7 @@ class RegisterError(HardwareError):
 
 class BusError(HardwareError):
     """The serial bus, real or virtual, could not carry a packet."""
+
+
+class SourceFault(HardwareError):
+    """What a rig follows, a simulation or a leader, gives no goals any more; the servos are sound."""

@@ -119,7 +119,7 @@ def check_motion(
     servo_v, _ = mapping.rates(q, v, np.zeros_like(v))
     servo_v_knots, servo_a = mapping.rates(motion.q, motion.v, motion.a)
     owners = [np.flatnonzero(mapping.matrix[:, j]) for j in range(len(mapping.joints))]
-    units = [joints.unit(j) for j in range(len(mapping.joints))]
+    units = mapping.units
     turns = ["rad"] * len(mapping.servos)
     tables = [
         _position(mapping.joints, t, q, joints.low, joints.high, "joint", units),

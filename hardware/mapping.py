@@ -109,7 +109,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Mapping:
-    """Joints (nj) and servos (ns) of a rig, angles in radian.
+    """Joints (nj) and servos (ns) of a rig, SI.
 
     Args:
         joints, servos: Names.
@@ -117,6 +117,7 @@ class Mapping:
         matrix: A (ns, nj).
         zero: b (ns,) [rad].
         curves: Transmission of a joint that is not the identity, by column.
+        units: Of the joints' values: rad, or m for one that slides.
     """
 
     joints: tuple[str, ...]
@@ -125,6 +126,7 @@ class Mapping:
     matrix: Array
     zero: Array
     curves: dict[int, Transmission]
+    units: tuple[str, ...]
 
     @cached_property
     def inverse(self) -> Array:
@@ -191,7 +193,8 @@ def make_mapping(rig: Rig) -> Mapping:
             matrix[row[name], columns] = block.matrix[k]
             zero[row[name]] = block.zero[k] * rig.unit if block.zero else 0.0
     curves = {i: c for i, item in enumerate(rig.joints) if (c := _curve(item, rig)) is not None}
-    return Mapping(tuple(joints), tuple(row), rig.ids, matrix, zero, curves)
+    units = tuple("m" if item.slides else "rad" for item in rig.joints)
+    return Mapping(tuple(joints), tuple(row), rig.ids, matrix, zero, curves, units)
 
 
 def _curve(item: JointItem, rig: Rig) -> Transmission | None:
@@ -254,23 +257,13 @@ class JointBounds:
     velocity: Array
     acceleration: Array
     torque: Array
-    units: tuple[str, ...] = ()
-
-    def unit(self, joint: int) -> str:
-        """Unit of a joint's position: rad, or m for one that slides."""
-        return self.units[joint] if self.units else "rad"
-
-
-def joint_units(rig: Rig) -> tuple[str, ...]:
-    """Units of the joints' positions: those with a crank or a table slide."""
-    return tuple("m" if item.crank or item.points else "rad" for item in rig.joints)
 
 
 def joint_bounds(rig: Rig, model: mujoco.MjModel | None = None) -> JointBounds:
     """Limits of the joints: the rig file's, for the range else the model's."""
     rows = []
     for item in rig.joints:
-        unit = 1.0 if item.crank or item.points else rig.unit
+        unit = rig.joint_unit(item)
         low, high = (-np.inf, np.inf) if item.range is None else (r * unit for r in item.range)
         if item.range is None and model is not None:
             index = lookup(model, "joint", rig.joint_in(model, item.joint))
@@ -279,15 +272,13 @@ def joint_bounds(rig: Rig, model: mujoco.MjModel | None = None) -> JointBounds:
         rate = [x * unit if x else np.inf for x in (item.velocity, item.acceleration)]
         rows.append((low, high, *rate, item.torque or np.inf))
     low, high, velocity, acceleration, torque = np.array(rows, dtype=float).T
-    return JointBounds(low, high, velocity, acceleration, torque, joint_units(rig))
+    return JointBounds(low, high, velocity, acceleration, torque)
 
 
 def park_pose(rig: Rig, start: Array) -> Array:
     """Joint values (nj,) of the stop 'park'; joints without one stay at `start`."""
-    units = [1.0 if j.crank or j.points else rig.unit for j in rig.joints]
-    return np.array(
-        [s if j.park is None else j.park * u for j, u, s in zip(rig.joints, units, start, strict=True)]
-    )
+    poses = zip(rig.joints, start, strict=True)
+    return np.array([s if j.park is None else j.park * rig.joint_unit(j) for j, s in poses])
 
 
 def within_joints(servos: Bounds, mapping: Mapping, joints: JointBounds) -> Bounds:

@@ -16,6 +16,7 @@ from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from ..models import load_model
 from ..models.naming import joint_names
+from ..sim.kinds import SCALAR
 from ..sim.scene.load import locate
 from ..sim.scene.mistakes import Mistake, Path_, report
 from ..sim.scene.schema import Item
@@ -86,7 +87,8 @@ class JointItem(Item):
     servos: list[DriveItem] = Field(default_factory=list, description="servos that share the joint")
     crank: CrankItem | None = None
     points: list[tuple[Finite, Finite]] | None = Field(
-        None, description="nonlinear transmission: pairs (joint value, crank angle), ascending in the first"
+        None,
+        description="nonlinear transmission: pairs (metres, crank angle), ascending in the first",
     )
     range: Range | None = Field(None, description="soft limits; default: the model's")
     velocity: Positive | None = None
@@ -109,6 +111,11 @@ class JointItem(Item):
             if any(du * steps[0][1] <= 0 for _, du in steps):
                 raise ValueError("'points' must rise or fall all the way, so that it can be inverted")
         return self
+
+    @property
+    def slides(self) -> bool:
+        """Whether the joint's values are metres, in this file as well: with a crank or a table."""
+        return self.crank is not None or self.points is not None
 
     @property
     def drives(self) -> list[DriveItem]:
@@ -197,6 +204,10 @@ class Rig(Item):
         found = [j.joint for j in self.joints if any(d.servo == servo for d in j.drives)]
         return found + [j for d in self.differentials if servo in d.servos for j in d.joints]
 
+    def joint_unit(self, item: JointItem) -> float:
+        """SI value of one unit of a joint's numbers in this file: a metre, or this file's unit of angles."""
+        return 1.0 if item.slides else self.unit
+
     def joint_in(self, model: mujoco.MjModel, joint: str) -> str:
         """Name of a rig's joint in a model: its own, with the prefix, or the only one 'anything/joint'."""
         names = joint_names(model)
@@ -280,13 +291,16 @@ def check_model(rig: Rig, model: mujoco.MjModel) -> None:
         index = names.index(name)
         kind = mujoco.mjtJoint(int(model.jnt_type[index]))
         slide = kind == mujoco.mjtJoint.mjJNT_SLIDE
-        if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if kind not in SCALAR:
             mistakes.append(
                 Mistake(
                     ("joints", i, "joint"), f"{item.joint!r} is a ball or free joint; a servo moves one axis"
                 )
             )
-        elif slide and item.crank is None and item.points is None:
+        elif item.slides and not slide:
+            message = f"{item.joint!r} turns; 'crank' and 'points' are for joints that slide, in metres"
+            mistakes.append(Mistake(("joints", i, "joint"), message))
+        elif slide and not item.slides:
             mistakes.append(
                 Mistake(
                     ("joints", i, "joint"),

@@ -9,9 +9,10 @@ from typing import Any, cast
 
 import mujoco
 
-from .control import Law
+from .control import Law, Sampled
 from .engines.interface import Engine, Problem, Role
 from .errors import PantographError, SceneError, unknown
+from .scene.schema import Scene
 
 
 def _law(module: str, name: str) -> Callable[[], Callable[..., Law]]:
@@ -81,6 +82,16 @@ def make_law(
         return with_reality(law, believed, problem.state0.q, period, reality)
     except (TypeError, PantographError) as e:
         raise SceneError(str(e)) from e
+
+
+def make_controls(scene: Scene, problem: Problem, period: float | None) -> Sampled | None:
+    """The scene's controller for a problem, sampled every ``period`` [s] (PD along the keys when the scene
+    names none); None without a period: nothing is controlled. Raises SceneError as :func:`make_law`."""
+    if period is None:
+        return None
+    item = scene.controller
+    law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, period)
+    return Sampled(law, problem, period)
 
 
 def known_words(name: str) -> tuple[str, ...]:

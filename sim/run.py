@@ -12,11 +12,10 @@ import numpy as np
 
 from .accuracy import estimate_error
 from .checks import check_frames
-from .compose import make_engine, make_law
-from .control import Sampled
+from .compose import make_controls, make_engine
 from .engines.common import Broken
 from .engines.derive import derive
-from .engines.interface import Array, Controls, Engine, Role, Segment
+from .engines.interface import Array, Engine, Role, Segment
 from .errors import EngineError, RunError
 from .plan import Plan, make_plan
 from .recording import Recording, model_to_bytes
@@ -42,7 +41,7 @@ def run(
     plan = scene if isinstance(scene, Plan) else make_plan(scene)
     problem = plan.problem
     engine = make_engine(plan.engine.what)
-    controls = _controls(plan)
+    controls = make_controls(plan.setup.scene, problem, plan.period)
     failure: BaseException | None = None
     try:
         segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
@@ -117,14 +116,6 @@ def _sentences(missed: dict[str, Array], t: Array) -> list[str]:
     from .scene.goals import sentences
 
     return sentences(missed, t)
-
-
-def _controls(plan: Plan) -> Controls | None:
-    if plan.period is None:
-        return None
-    item = plan.setup.scene.controller
-    law = make_law(item.law if item else "pd", plan.problem, item.parameters if item else {}, plan.period)
-    return Sampled(law, plan.problem, plan.period)
 
 
 def _versions() -> dict[str, str]:

@@ -13,11 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .compose import make_law
-from .control import Sampled
-from .engines.contact import INTEGRATORS, ContactEngine
-from .engines.interface import Engine, Role
-from .engines.smooth import SmoothEngine
+from .compose import make_controls, make_engine
+from .engines.contact import INTEGRATORS
+from .engines.interface import Role
 from .engines.touch import can_touch
 from .errors import EngineError
 from .integrate import TABLEAUS
@@ -63,12 +61,8 @@ class SceneWork:
             sample_every=round(case.duration / case.frames / step),
             duration=case.duration,
         )
-        controls = None
-        if plan.period is not None:
-            item = plan.setup.scene.controller
-            law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, plan.period)
-            controls = Sampled(law, problem, plan.period)
-        engine: Engine = SmoothEngine() if self.engine == "smooth" else ContactEngine()
+        controls = make_controls(plan.setup.scene, problem, plan.period)
+        engine = make_engine(self.engine)
         segment = engine.run(problem, (0.0, case.duration), controls)
         q, v = (
             np.full((case.frames + 1, case.model.nq), np.nan),

@@ -437,3 +437,24 @@ def test_real_robots_mirror_to_virtual_rigs(name: str, keys: dict[str, list[floa
     assert heavy.status == "done"
     worst = max(t.rms_aligned for t in heavy.tracking)
     assert max(t.rms_aligned for t in report.tracking) < worst < 0.12  # it sags under its own weight
+
+
+@pytest.mark.parametrize("follows", [False, True])
+@pytest.mark.parametrize("fault", ["cable", "servo"])
+def test_leader_that_falls_silent_ends_it_and_keeps_what_was_read(follows: bool, fault: str) -> None:
+    rig = parse_rig(RIG)
+    lead, follower = leader_bus(rig, lambda t: np.array([0.2 * t, 0.1])), virtual_bus(rig)
+
+    def each(t: float, q: np.ndarray) -> None:
+        if t > 0.5 and fault == "servo":
+            lead[2].dead = True
+        if t > 0.5 and fault == "cable":
+            lead.dice.apply = lambda *_: []
+
+    more = {"follower": rig, "follower_bus": follower, "stop": "park"} if follows else {}
+    report = teleoperate(rig, duration=5.0, leader_bus=lead, each=each, **more)
+    assert report.status == "fault" and "leader: " in report.message
+    assert 0.5 < report.t[-1] < 1.0
+    if follows:
+        assert report.follower.stop == "parked, then limp"  # the follower is sound
+        assert not any(s.get("torque_enable") for s in follower.servos)

@@ -138,7 +138,8 @@ def test_joints_that_a_model_lacks_are_told_at_once() -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint name="lift" type="hinge"/><geom size=".1"/>
         <body><joint name="pitch" type="ball"/><geom size=".1"/>
-        <body><joint name="finger" type="slide" range="0.02 0.03" limited="true"/><geom size=".1"/></body>
+        <body><joint name="finger" type="slide" range="0.02 0.03" limited="true"/><geom size=".1"/>
+        <body><joint name="hatch" type="hinge"/><geom size=".1"/></body></body>
         </body></body></worldbody></mujoco>"""
     )
     with pytest.raises(RigError) as e:
@@ -149,7 +150,7 @@ def test_joints_that_a_model_lacks_are_told_at_once() -> None:
         "'pitch' is a ball",
         "no joint 'roll'",
         "wider than the model's [0.02, 0.03]",
-        "no joint 'hatch'",
+        "'hatch' turns; 'crank' and 'points' are for joints that slide",
     ):
         assert words in text
 
@@ -261,7 +262,7 @@ def test_joints_of_a_named_model_in_a_scene() -> None:
 
 # The verdict.
 
-ONE = Mapping(("j",), ("s",), (1,), np.array([[2.0]]), np.zeros(1), {})
+ONE = Mapping(("j",), ("s",), (1,), np.array([[2.0]]), np.zeros(1), {}, ("rad",))
 FREE = JointBounds(*(np.array([x]) for x in (-np.inf, np.inf, np.inf, np.inf, np.inf)))
 
 
@@ -379,7 +380,7 @@ def test_loads_split_as_a_pendulum_does() -> None:
     model = f"""<mujoco><option gravity="0 0 -9.81"/><worldbody><body>
         <joint name="j" axis="0 1 0" damping="{d}" frictionloss="{friction}" armature="{armature}"/>
         <inertial pos="0 0 {-rod}" mass="{m}" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>"""
-    mapping = Mapping(("j",), ("s",), (1,), np.eye(1), np.zeros(1), {})
+    mapping = Mapping(("j",), ("s",), (1,), np.eye(1), np.zeros(1), {}, ("rad",))
     recording = _pendulum_recording(model)
     rig = parse_rig('servos = [{name="s", id=1, model="mx-28"}]\n[[joints]]\njoint = "j"\nservo = "s"')
     motion, loads = motion_of(recording, rig, mapping), loads_of(recording, rig, mapping)

@@ -6,7 +6,6 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -47,19 +46,14 @@ def stop_word(word: str) -> Stop:
 @contextmanager
 def driver_of(port: str, baud: int) -> Iterator[Any]:
     """Driver of a bare serial port."""
-    from ..connect import REAL_MARGIN, TERMINAL_MARGIN
-    from ..driver import Driver
-    from ..ports import latency_of, open_port
+    from ..connect import open_driver
 
     if port == VIRTUAL:
         raise HardwareError(
             "virtual servos in memory belong to a rig; 'pantograph servo simulate' gives a port"
         )
-    latency = latency_of(port)
-    opened, clock = open_port(port, baud)
-    margin = TERMINAL_MARGIN if Path(port).resolve().parent.name == "pts" else REAL_MARGIN
-    driver = Driver(opened, clock, latency=latency.seconds, margin=margin)
-    console.print(f"[dim]{escape(latency.note)}")
+    driver, note = open_driver(port, baud)
+    console.print(f"[dim]{escape(note)}")
     try:
         yield driver
     finally:

@@ -50,7 +50,8 @@ def jog(
         if joint not in mapping.joints:
             raise HardwareError(unknown("joint", joint, mapping.joints, where=loaded.name))
         j = mapping.joints.index(joint)
-        step = by * 1e-3 if j in mapping.curves else np.radians(by)
+        slides = mapping.units[j] == "m"
+        step = by * 1e-3 if slides else np.radians(by)
         bounds = joint_bounds(loaded)
 
         def first(present: Any) -> Any:
@@ -72,9 +73,7 @@ def jog(
         driver.close()
     if report.status == "done":
         text = (
-            f"{report.measured[-1, j]:.4f} m"
-            if j in mapping.curves
-            else f"{np.degrees(report.measured[-1, j]):.2f} deg"
+            f"{report.measured[-1, j]:.4f} m" if slides else f"{np.degrees(report.measured[-1, j]):.2f} deg"
         )
         console.print(f"{joint} is at {text}; the rig {report.stop}")
     else:

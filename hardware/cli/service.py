@@ -184,12 +184,13 @@ def calibrate(
     """Walk through the joints by hand and write the rig file."""
     from ...models import load_model
     from ...models.naming import joint_names
+    from ...sim.kinds import SCALAR
     from .. import calibrate as by_hand
 
     if out.exists():
         raise HardwareError(f"{out} exists; choose another name, or remove it first")
     robot = load_model(model)
-    scalar = [n for i, n in enumerate(joint_names(robot)) if int(robot.jnt_type[i]) in (2, 3)]
+    scalar = [name for name, kind in zip(joint_names(robot), robot.jnt_type, strict=True) if kind in SCALAR]
     with driver_of(port, baud) as driver:
         found = list(driver.broadcast_ping().values())
         if not found:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pickle
 import queue
+import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -15,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.plan import Plan, make_plan
+from ...sim.plan import Plan
 from ...sim.scene.schema import Scene
-from ..errors import HardwareError
+from ..errors import HardwareError, SourceFault
 from ..mapping import Mapping, indices
 from ..motion import Motion
 from ..rig import Rig
@@ -25,6 +26,7 @@ from ..rig import Rig
 Array = NDArray[np.float64]
 Window = tuple[Array, Array, Array]
 
+_PATIENCE = 1.0  # s that a process whose pipe is closed has to end
 AHEAD = 3  # windows that are computed before they are needed
 
 
@@ -32,15 +34,12 @@ class Live:
     """A running simulation as a source of joint values; a context manager.
 
     Args:
-        scene: What runs.
+        plan: What runs.
         rig, mapping: The rig and its joints.
         patient: Wait for the simulation when it is late (virtual time); else hold and count.
     """
 
-    def __init__(
-        self, scene: Scene | Plan | str | Path, rig: Rig, mapping: Mapping, *, patient: bool
-    ) -> None:
-        plan = scene if isinstance(scene, Plan) else make_plan(scene)
+    def __init__(self, plan: Plan, rig: Rig, mapping: Mapping, *, patient: bool) -> None:
         self.model: mujoco.MjModel = plan.problem.model
         self.duration = plan.problem.steps * plan.problem.step
         self._scene = plan.setup.scene
@@ -57,21 +56,32 @@ class Live:
         self.first: Array = plan.problem.state0.q[self._qpos].copy()
 
     def __enter__(self) -> Live:
-        program = f"{__package__}.windows"
+        # A session of its own: Ctrl-C is the mirror's business, also while the process loads.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-m", f"{__package__}.windows"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
         )
-        assert self._process.stdin is not None
         self._thread.start()
         try:
-            pickle.dump(self._scene, self._process.stdin)
-            self._process.stdin.close()
+            self._send(self._scene)
             self._take(wait=True)
         except BaseException:  # nothing else ends the process and the thread then
             self.__exit__(None, None, None)
             raise
         self.first = self._parts[0][1][0][self._qpos]
         return self
+
+    def _send(self, scene: Scene) -> None:
+        """The scene to the process; one that ended before is left to `_take`, which is told why."""
+        try:
+            data = pickle.dumps(scene)
+        except Exception as e:
+            raise HardwareError(f"a simulation beside the rig cannot take this scene: {e}") from e
+        assert self._process.stdin is not None
+        with suppress(OSError), self._process.stdin as pipe:
+            pipe.write(data)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -93,11 +103,11 @@ class Live:
     def at(self, t: float) -> Array | None:
         """Joint values (nj,) at time t [s]; those of the last moment known when it is not computed yet.
 
-        Raises HardwareError when the simulation failed.
+        Raises SourceFault when the simulation failed.
         """
         while self._end < min(t, self.duration) - 1e-9:
             if self._failure:
-                raise HardwareError(f"the simulation stopped at t = {self._end:.3f} s: {self._failure}")
+                raise SourceFault(f"the simulation stopped at t = {self._end:.3f} s: {self._failure}")
             if not self._take(wait=self.patient):
                 self.starved += 1
                 break
@@ -123,7 +133,6 @@ class Live:
         if isinstance(item, str):
             self._failure = item
             if not self._parts:
-                self._process.kill()
                 raise HardwareError(f"the simulation did not start: {item}")
             return True
         self._parts.append(item)
@@ -133,18 +142,32 @@ class Live:
         return True
 
     def _receive(self) -> None:
-        """The thread: from the process to the queue."""
+        """The thread: from the process to the queue, which is told how it ended in any case."""
         assert self._process.stdout is not None
+        item: Window | str | None
         while not self._stop.is_set():
             try:
                 item = pickle.load(self._process.stdout)
-            except (EOFError, pickle.UnpicklingError):
-                item = "its process ended"
+            except EOFError:
+                item = self._ending()
+            except Exception as e:  # torn bytes raise nearly anything
+                item = f"{self._ending()} in the middle of a window ({type(e).__name__}: {e})"
             if item is None:
                 return
             self._put(item)
             if isinstance(item, str):
                 return
+
+    def _ending(self) -> str:
+        """How the process ended; one that still runs has nothing more to say and is ended."""
+        try:
+            code = self._process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return "what its process sends is no motion"
+        if code < 0:
+            return f"its process was ended by signal {-code} ({signal.strsignal(-code)})"
+        return f"its process ended with exit status {code}"
 
     def _put(self, item: Window | str) -> None:
         while not self._stop.is_set():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.plan import Plan
+from ...sim.plan import Plan, make_plan
 from ...sim.recording import Recording, load
 from ...sim.scene.schema import Scene
 from ..connect import connect
@@ -113,8 +113,9 @@ def mirror_live(
     rig = load_rig(rig) if isinstance(rig, str | Path) else rig
     mapping = make_mapping(rig)
     virtual = bus is not None or (port or rig.port) == VIRTUAL
-    with Live(scene, rig, mapping, patient=virtual and not paced) as live:
-        check_model(rig, live.model)
+    plan = scene if isinstance(scene, Plan) else make_plan(scene)
+    check_model(rig, plan.problem.model)
+    with Live(plan, rig, mapping, patient=virtual and not paced) as live:
         driver, note = connect(rig, port=port, bus=bus, paced=paced)
         try:
             session = Session(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...sim.recording import Recording, model_to_bytes
 from ..driver import Driver, Statistics
 from ..limits import Verdict
-from ..mapping import Mapping, indices, joint_units
+from ..mapping import Mapping, indices
 from ..rig import Rig
 from ..virtual.motor import MOTORS
 from .contract import FEEDBACK
@@ -152,7 +152,7 @@ def make_report(
         commanded = mapping.joint(np.array([log.goal[i] for i in rows]))
         measured = _joints_heard(mapping, feedback[:, :, 0])
         tracking = tuple(
-            replace(_track(name, t, commanded[:, j], measured[:, j]), unit=joint_units(rig)[j])
+            replace(_track(name, t, commanded[:, j], measured[:, j]), unit=mapping.units[j])
             for j, name in enumerate(mapping.joints)
         )
         if model is not None and np.isfinite(measured).any(axis=0).all():

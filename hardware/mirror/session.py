@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..driver import Driver, NoAnswer, Refused
-from ..errors import BusError
+from ..errors import BusError, SourceFault
 from ..mapping import Mapping, joint_bounds, make_bounds, make_mapping, park_pose, within_joints
 from ..rig import Rig, RigError, Stop
 from .contract import Phase, Ready, RigFault, freeze, prepare, release, scan, torque_on
@@ -81,7 +81,7 @@ class Session:
         `first` may be a function of where the servos stand; a target of None ends the stream.
         A fault or Ctrl-C ends in an outcome; any other exception stops the rig and goes on to the caller.
         """
-        out = self.outcome
+        out, sound = self.outcome, True
         try:
             self._start()
             assert self._loop is not None
@@ -91,8 +91,11 @@ class Session:
             self._loop.run(target, duration, "stream")
         except KeyboardInterrupt:
             out.status, out.message = "interrupted", f"interrupted in phase {self._now!r}"
+        except SourceFault as e:
+            self._record(e)
         except (RigFault, NoAnswer, Refused, BusError) as e:
             self._record(e)
+            sound = False
         except BaseException as e:
             out.status, out.phase, out.message = "fault", self._now, f"{type(e).__name__}: {e}"
             self._stop(sound=True)
@@ -101,7 +104,7 @@ class Session:
             out.phase = "stop"
         if out.status == "interrupted":
             out.phase = self._now
-        self._stop(sound=out.status != "fault")
+        self._stop(sound=sound)
         return out
 
     @property

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from ...sim.recording import Recording
 from ..connect import connect
 from ..driver import Driver
+from ..errors import BusError, SourceFault
 from ..mapping import joint_bounds, make_mapping
 from ..rig import Rig, RigError, Stop, load_rig
 from ..virtual import VirtualBus
-from .contract import FEEDBACK, RigFault, scan
+from .contract import FEEDBACK, scan
 from .loop import PATIENCE, Log
 from .record import MirrorReport, make_report
 from .session import Outcome, Session
@@ -45,14 +46,21 @@ class Leader:
         return self.read()
 
     def read(self) -> Array:
-        """Joint values (nj,) now; the last known of a servo that is silent for a moment."""
-        angle = self._block.decode(self.driver.read_block(self._block, retries=1))[:, 0]
+        """Joint values (nj,) now; the last known of a servo that is silent for a moment.
+
+        Raises SourceFault for one that stays silent, or a cable that is out.
+        """
+        try:
+            replies = self.driver.read_block(self._block, retries=1)
+        except BusError as e:
+            raise SourceFault(f"leader: {e}") from e
+        angle = self._block.decode(replies)[:, 0]
         heard = ~np.isnan(angle)
         self._silent = np.where(heard, 0, self._silent + 1)
         self._servo = np.where(heard, angle, self._servo)
         if (self._silent >= PATIENCE).any():
             id = self.rig.ids[int(np.argmax(self._silent))]
-            raise RigFault("stream", f"leader: {self.rig.label(id)} does not answer any more", servo=id)
+            raise SourceFault(f"leader: {self.rig.label(id)} does not answer any more")
         return self.mapping.joint(self._servo)
 
 
@@ -129,7 +137,7 @@ def _watch(rig: Rig, read: Callable[[float], Array], duration: float) -> tuple[s
             k += 1
     except KeyboardInterrupt:
         return "interrupted", "interrupted by a person"
-    except RigFault as e:
+    except SourceFault as e:
         return "fault", str(e)
     return "done", ""
 

@@ -1,23 +1,26 @@
 """A simulation computed window by window; as a program, in a process of its own for `Live`.
 
-Program: a pickled Scene comes in on standard input, windows go out on standard output as pickles, (t, q, v)
-each, then None; a string in place of a window says why there are no more. A full pipe makes it wait.
+Program: a pickled Scene comes in on standard input. Windows go out on what was its standard output, as
+pickles (t, q, v), then None; a string in place of a window says why there are no more. A full pipe makes it
+wait. What a law or a library prints goes to standard error, so that it cannot tear a window.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import os
 import pickle
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from math import ceil
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.compose import make_engine, make_law
-from ...sim.control import Sampled
+from ...sim.compose import make_controls, make_engine
 from ...sim.engines.interface import Controls, Held, Problem, State
 from ...sim.plan import Plan, make_plan
 from ..errors import HardwareError
@@ -45,11 +48,7 @@ def windows(plan: Plan) -> Iterator[Window]:
     """
     problem, h = plan.problem, plan.problem.step
     engine = make_engine(plan.engine.what)
-    controls: Controls | None = None
-    if plan.period is not None:
-        item = plan.setup.scene.controller
-        law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, plan.period)
-        controls = Sampled(law, problem, plan.period)
+    controls = make_controls(plan.setup.scene, problem, plan.period)
     state, step = problem.state0, 0
     while step < problem.steps:
         n = min(_steps(problem, plan.period), problem.steps - step)
@@ -74,18 +73,25 @@ def _steps(problem: Problem, period: float | None) -> int:
 def main() -> None:
     """See the module."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the mirror's business
-    out = sys.stdout.buffer
-    try:
-        scene = pickle.load(sys.stdin.buffer)
-        for window in windows(make_plan(scene)):
-            pickle.dump(window, out)
-            out.flush()
-        pickle.dump(None, out)
-    except BrokenPipeError:
-        return
-    except Exception as e:
-        pickle.dump(str(e) or type(e).__name__, out)
-    out.flush()
+    with suppress(BrokenPipeError), _taken_stdout() as out:  # a reader that left needs no more windows
+        try:
+            scene = pickle.load(sys.stdin.buffer)
+            for window in windows(make_plan(scene)):
+                pickle.dump(window, out)
+                out.flush()
+            pickle.dump(None, out)
+        except BrokenPipeError:
+            raise
+        except Exception as e:
+            pickle.dump(str(e) or type(e).__name__, out)
+
+
+def _taken_stdout() -> BinaryIO:
+    """Standard output as a file of its own; descriptor 1 is standard error from now on."""
+    sys.stdout.flush()
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return out
 
 
 if __name__ == "__main__":
