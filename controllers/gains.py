@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from numbers import Real
 
 import mujoco
 import numpy as np
@@ -15,29 +16,89 @@ Array = NDArray[np.float64]
 Gain = float | Mapping[str, float]
 
 
-def positive(what: str, value: float, *, zero: bool = False) -> float:
+def number(what: str, value: object) -> float:
+    """``value`` as a finite number, else PantographError."""
+    if isinstance(value, Real) and not isinstance(value, bool) and np.isfinite(float(value)):
+        return float(value)
+    raise PantographError(f"{what} must be a number, got {value!r}")
+
+
+def positive(what: str, value: object, *, zero: bool = False) -> float:
     """``value`` if it is a positive number (or zero, if that may be), else PantographError."""
-    good = isinstance(value, int | float) and np.isfinite(value) and (value > 0 or (zero and value == 0))
-    if not good:
-        raise PantographError(
-            f"{what} must be a {'number >= 0' if zero else 'positive number'}, got {value!r}"
-        )
-    return float(value)
+    if isinstance(value, Real) and not isinstance(value, bool) and np.isfinite(float(value)):
+        if float(value) > 0 or (zero and value == 0):
+            return float(value)
+    raise PantographError(f"{what} must be a {'number >= 0' if zero else 'positive number'}, got {value!r}")
 
 
-def per_joint(model: mujoco.MjModel, what: str, gain: Gain) -> Array:
-    """One number >= 0 a degree of freedom (nv,), from one for all or one a joint by name (others zero).
+def whole(what: str, value: object, *, least: int = 1) -> int:
+    """``value`` if it is a whole number of at least ``least``, else PantographError."""
+    if (
+        isinstance(value, Real)
+        and not isinstance(value, bool)
+        and float(value).is_integer()
+        and value >= least
+    ):
+        return int(value)
+    raise PantographError(f"{what} must be a whole number >= {least}, got {value!r}")
 
-    Raises PantographError for a number that is negative or a name that is no joint.
+
+def switch(what: str, value: object) -> bool:
+    """``value`` if it is true or false, else PantographError."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise PantographError(f"{what} must be true or false, got {value!r}")
+
+
+def choice(what: str, value: object, options: Sequence[str], where: str) -> str:
+    """``value`` if it is one of ``options``, else PantographError listing these."""
+    if isinstance(value, str) and value in options:
+        return value
+    raise PantographError(unknown(what, str(value), options, where=where))
+
+
+def per_joint(
+    model: mujoco.MjModel, what: str, gain: Gain, *, missing: float = 0.0, zero: bool = True
+) -> Array:
+    """One number >= 0 (> 0 without ``zero``) a degree of freedom (nv,), from one for all or one a joint by
+    name; "" stands for all joints, before others are named, which have ``missing`` without it.
+
+    Raises PantographError for what is no such number or no mapping of them, and a name that is no joint.
     """
-    out = np.zeros(model.nv)
+    out = np.full(model.nv, missing)
     names = {name: j for j, name in enumerate(joint_names(model))}
-    for name, value in (gain if isinstance(gain, Mapping) else {"": gain}).items():
-        positive(what, value, zero=True)
+    for name, value in sorted(gain.items()) if isinstance(gain, Mapping) else [("", gain)]:
         if name and name not in names:
-            raise PantographError(f"{what}: {unknown('joint', name, names)}")
-        out[model.dof_jntid == names[name] if name else slice(None)] = value
+            raise PantographError(f"{what}: {unknown('joint', str(name), names)}")
+        of = f"{what} of {name!r}" if name else what
+        out[model.dof_jntid == names[name] if name else slice(None)] = positive(of, value, zero=zero)
     return out
+
+
+def limit_per_joint(model: mujoco.MjModel, what: str, limit: Gain | None) -> Array:
+    """As :func:`per_joint` for limits: positive, infinite for joints that are not named, and without any."""
+    return per_joint(model, what, {} if limit is None else limit, missing=np.inf, zero=False)
+
+
+def force_weights(
+    model: mujoco.MjModel, tracked: NDArray[np.bool_], force: Gain | None, weight: Array, what: str
+) -> Array:
+    """Cost (m,) of the squared force of each driven freedom ``tracked`` (nv,).
+
+    Without ``force`` it is 1 / f^2 with f what the freedom's drive can give, or its ``weight`` (nv,) [N m, N]
+    (at least 1) where it can give anything. Raises PantographError, naming the law ``what``, for forces that
+    cost nothing.
+    """
+    if force is None:
+        low, high = force_limits(model)
+        able = np.minimum(-low, high)
+        scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(weight)))
+        weights = 1.0 / np.maximum(scale, 1e-9) ** 2
+    else:
+        weights = per_joint(model, f"{what} force", force)
+    if not (weights[tracked] > 0).all():
+        raise PantographError(f"{what} force: every joint that it drives must cost something")
+    return np.asarray(weights[tracked])
 
 
 def felt_inertia(model: mujoco.MjModel, q: Array) -> Array:

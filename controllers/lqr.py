@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ..sim.clip import Clip
 from ..sim.control import Target
-from ..sim.errors import PantographError
 from .design.linear import held_matrices, linearise_path
 from .design.riccati import along, dlqr
-from .gains import Gain, force_limits, per_joint
+from .gains import Gain, force_weights, per_joint
 from .nominal import Nominal, difference
 from .preview import Preview, aimed
 
@@ -75,16 +74,8 @@ class LQR:
             per_joint(model, "the LQR's velocity", velocity),
         ]
         self.Q = np.diag(np.concatenate([weight[moving] for weight in state])) * period
-        if force is None:
-            low, high = force_limits(model)
-            able = np.minimum(-low, high)
-            scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(self.nominal.weight(q0))))
-            weights = 1.0 / np.maximum(scale, 1e-9) ** 2
-        else:
-            weights = per_joint(model, "the LQR's force", force)
-        if not (weights[tracked] > 0).all():
-            raise PantographError("the LQR's force: every joint that it drives must cost something")
-        self.R = np.diag(weights[tracked]) * period
+        weight = self.nominal.weight(q0)
+        self.R = np.diag(force_weights(model, tracked, force, weight, "the LQR's")) * period
 
     @cached_property
     def solution(self) -> Solution:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.control import Target
-from .gains import Gain, felt_inertia, per_joint, positive
+from .gains import Gain, felt_inertia, per_joint, positive, switch
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,8 @@ class PD:
     ) -> None:
         positive("the PD law's frequency", frequency)
         positive("the PD law's damping", damping)
-        self.model, self.tracked, self.gravity = model, tracked, gravity
+        self.model, self.tracked = model, tracked
+        self.gravity = switch("the PD law's gravity", gravity)
         self.data = mujoco.MjData(model)
         inertia = felt_inertia(model, q0)
         w = 2.0 * np.pi * frequency

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.control import Target
-from ..sim.errors import PantographError, unknown
-from .gains import Gain, felt_inertia, force_limits, per_joint, positive, unit_free_gains
+from .gains import Gain, choice, felt_inertia, force_limits, per_joint, positive, unit_free_gains
 from .nominal import Nominal, difference
 
 Array = NDArray[np.float64]
@@ -56,8 +55,7 @@ class PID:
     ) -> None:
         w = 2.0 * np.pi * positive("the PID law's frequency", frequency)
         positive("the PID law's damping", damping)
-        if feedforward not in _FEEDFORWARD:
-            raise PantographError(unknown("feedforward", str(feedforward), _FEEDFORWARD, where="the PID law"))
+        choice("feedforward", feedforward, _FEEDFORWARD, "the PID law")
         self.model, self.tracked, self.feedforward = model, tracked, feedforward
         self.kp, self.kd = unit_free_gains(felt_inertia(model, q0), frequency, damping)
         if kp is not None:

@@ -13,6 +13,7 @@ from ..sim.clip import Clip
 from ..sim.control import Target
 from ..sim.errors import PantographError, unknown
 from ..sim.kinds import SCALAR
+from .gains import number
 from .nominal import moved
 
 Array = NDArray[np.float64]
@@ -61,14 +62,17 @@ class Preview:
 def aimed(clip: Clip, goal: Mapping[str, float], what: str) -> tuple[Clip, NDArray[np.bool_]]:
     """``clip`` with joints that have no keys at ``goal`` (joint -> value), and the mask (nq,) of these.
 
-    Raises PantographError, saying ``what`` it is about, for names that are no hinge or slide, or have keys.
+    Raises PantographError, saying ``what`` it is about, for names that are no hinge or slide, or have keys, and
+    for values that are no numbers.
     """
     model, q0, mask = clip.model, clip.q0.copy(), np.zeros(clip.model.nq, dtype=bool)
+    if not isinstance(goal, Mapping):
+        raise PantographError(f"{what} is a value for each joint, as {{hinge = 0.0}}, not {goal!r}")
     names = joint_names(model)
     free = [n for j, n in enumerate(names) if model.jnt_type[j] in SCALAR and n not in clip.tracks]
     for name, value in goal.items():
         if name not in free:
             raise PantographError(f"{what}: {unknown('joint without keys', name, free)}")
         at = model.jnt_qposadr[names.index(name)]
-        q0[at], mask[at] = value, True
+        q0[at], mask[at] = number(f"{what} of {name!r}", value), True
     return Clip(model, clip.tracks, q0), mask

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.control import Law, Target
-from ..sim.errors import PantographError, unknown
+from ..models import name_of
+from ..sim.errors import PantographError
 from ..sim.kinds import SCALAR
-from .gains import Gain, force_limits, per_joint, positive
+from .gains import Gain, choice, felt_inertia, force_limits, limit_per_joint, per_joint, positive
+from .nominal import difference
 from .observers import Kalman, Observer, VelocityFilter
+from .play import Play, Rotors
 
 Array = NDArray[np.float64]
 OBSERVERS = ("none", "filter", "kalman", "extended")
@@ -21,13 +24,16 @@ OBSERVERS = ("none", "filter", "kalman", "extended")
 
 class LoopMemory(NamedTuple):
     """Memory of a loop: the law's own and the observer's, forces on their way (oldest first) and applied,
-    where the play's middle is (nv,), last noise-free output."""
+    where the encoders' plays have their middles (scalar joints,), the rotors of gears with play, and which
+    drives gave all they could (nv,)."""
 
     law: Any
     observer: Any
     queue: tuple[Array, ...]
     applied: Array
-    play: Array | None
+    middles: Array | None
+    rotors: Rotors | None
+    cut: NDArray[np.bool_]
 
 
 class Loop:
@@ -41,13 +47,20 @@ class Loop:
     - ``delay`` [s]: forces take effect that much later, rounded up to whole periods;
     - ``saturation``: forces are cut at this fraction of what the drives can give (see also ``top_speed``);
     - ``top_speed`` [rad/s, m/s]: motor force falls linearly to zero at this joint speed;
-    - ``friction`` [N m, N]: dry friction that drives lose, smoothed below ``stiction`` [rad/s, m/s].
+    - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
+      :class:`~pantograph.controllers.play.Play`;
+    - ``friction`` [N m, N]: dry friction that drives lose, smoothed below ``stiction`` [rad/s, m/s], or below
+      the speed that it stops within a period.
+
+    Raises PantographError for values that make no sense, and for ``saturation`` and ``top_speed`` of drives
+    ``tracked`` (nv,) that can give anything.
     """
 
     def __init__(
         self,
         law: Law,
         model: mujoco.MjModel,
+        tracked: NDArray[np.bool_],
         q0: Array,
         period: float,
         *,
@@ -58,40 +71,58 @@ class Loop:
         delay: float = 0.0,
         saturation: float | None = None,
         top_speed: Gain | None = None,
+        play: Gain = 0.0,
         friction: Gain = 0.0,
         stiction: float = 0.02,
     ) -> None:
-        if observer not in OBSERVERS:
-            raise PantographError(unknown("observer", str(observer), OBSERVERS, where="a loop"))
+        choice("observer", observer, OBSERVERS, "a loop")
         self.law, self.model = law, model
         self.counts = positive("encoder", encoder, zero=True)
         self.backlash = per_joint(model, "backlash", backlash)
         self.late = int(np.ceil(positive("delay", delay, zero=True) / period - 1e-9))
-        self.share = None if saturation is None else positive("saturation", saturation)
-        self.low, self.high = force_limits(model)
-        self.top = None if top_speed is None else per_joint(model, "top_speed", top_speed)
-        self.friction, self.stiction = per_joint(model, "friction", friction), positive("stiction", stiction)
-        self.observer = _observer(observer, model, q0, corner, self.counts)
+        share = 1.0 if saturation is None else positive("saturation", saturation)
+        self.low, self.high = (share * limit for limit in force_limits(model))
+        self.top = np.where(tracked, limit_per_joint(model, "top_speed", top_speed), np.inf)
+        for word, slowed in (("saturation", share != 1.0), ("top_speed", np.isfinite(self.top))):
+            self._needs_limits(word, tracked & slowed)
+        self.friction = per_joint(model, "friction", friction)
+        stopped = self.friction * period / felt_inertia(model, q0)
+        self.stiction = np.maximum(positive("stiction", stiction), stopped)
+        self.play = Play(model, np.where(tracked, per_joint(model, "play", play), 0.0), period)
+        self.observer = _observer(observer, model, q0, positive("corner", corner), self.counts)
+
+    def _needs_limits(self, word: str, dofs: NDArray[np.bool_]) -> None:
+        for dof in np.flatnonzero(dofs & ~np.isfinite(self.high - self.low)):
+            joint = name_of(self.model, "joint", int(self.model.dof_jntid[dof]))
+            raise PantographError(
+                f"{word} needs to know what the drive of {joint!r} can give: it is an ideal force, or its "
+                "actuator has no ctrlrange or forcerange"
+            )
 
     def start(self) -> LoopMemory:
         """Nothing on its way, nothing measured yet."""
         nothing = np.zeros(self.model.nv)
         seen = None if self.observer is None else self.observer.start()
-        return LoopMemory(self.law.start(), seen, (nothing,) * self.late, nothing, None)
+        queue = (nothing,) * self.late
+        return LoopMemory(self.law.start(), seen, queue, nothing, None, None, nothing != 0.0)
 
     def __call__(
         self, t: float, q: Array, v: Array, target: Target, memory: LoopMemory
     ) -> tuple[Array, LoopMemory]:
         """Joint forces (nv,) that arrive now; see :class:`~pantograph.sim.control.Law`."""
-        y, play = self._measure(q, memory.play)
+        y, middles = self._measure(q, memory.middles)
         seen, q_seen, v_seen = memory.observer, y, v
         if self.observer is not None:
             seen = self.observer.update(seen, t, y, memory.applied)
             q_seen, v_seen = seen.q, seen.v
         tau, inner = self.law(t, q_seen, v_seen, target, memory.law)
-        queue = (*memory.queue, tau)
-        given = self._drive(queue[0], v)
-        return given, LoopMemory(inner, seen, queue[1:], given, play)
+        queue, rotors = (*memory.queue, tau), memory.rotors
+        given, cut = self._drive(queue[0], v)
+        if len(self.play.dofs):
+            at = difference(self.model, self.model.qpos0, q)
+            given, rotors = self.play.pass_on(given, at, v, rotors or self.play.start(at, v))
+        given = np.asarray(given - self.friction * np.tanh(v / self.stiction))
+        return given, LoopMemory(inner, seen, queue[1:], given, middles, rotors, cut)
 
     def _measure(self, q: Array, play: Array | None) -> tuple[Array, Array | None]:
         """What the encoders show, (nq,), and where the middles of the plays are now."""
@@ -107,33 +138,30 @@ class Loop:
             y[at] = np.round(y[at] / unit) * unit
         return y, play
 
-    def _drive(self, tau: Array, v: Array) -> Array:
-        """What of the forces asked for arrives at the joints, (nv,)."""
-        low, high = self.low, self.high
-        if self.share is not None:
-            low, high = self.share * low, self.share * high
-        if self.top is not None:
-            with np.errstate(invalid="ignore", divide="ignore"):
-                # a motor gives its whole force against its motion, and none beyond its top speed
-                push = np.clip(1.0 - np.where(self.top > 0, np.abs(v) / self.top, 0.0), 0.0, 1.0)
-                high, low = np.where(v > 0, high * push, high), np.where(v < 0, low * push, low)
-        if self.share is not None or self.top is not None:
-            tau = np.clip(
-                tau,
-                np.nan_to_num(low, nan=-np.inf, neginf=-np.inf),
-                np.nan_to_num(high, nan=np.inf, posinf=np.inf),
-            )
-        return np.asarray(tau - self.friction * np.tanh(v / self.stiction))
+    def _drive(self, tau: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """What motors give of the forces asked for, (nv,), and whether it is all they can."""
+        # a motor gives its whole force against its motion, and none beyond its top speed
+        left = np.clip(1.0 - np.abs(v) / self.top, 0.0, 1.0)
+        high, low = np.where(v > 0, left * self.high, self.high), np.where(v < 0, left * self.low, self.low)
+        return np.clip(tau, low, high), (tau <= low) | (tau >= high)
 
 
 LOOP_WORDS = (
-    "encoder", "backlash", "observer", "corner", "delay", "saturation", "top_speed", "friction", "stiction",
+    "encoder", "backlash", "observer", "corner", "delay", "saturation", "top_speed", "play", "friction",
+    "stiction",
 )  # fmt: skip
 
 
-def with_reality(law: Law, model: mujoco.MjModel, q0: Array, period: float, words: Mapping[str, Any]) -> Law:
+def with_reality(
+    law: Law,
+    model: mujoco.MjModel,
+    tracked: NDArray[np.bool_],
+    q0: Array,
+    period: float,
+    words: Mapping[str, Any],
+) -> Law:
     """``law`` inside a :class:`Loop` when any of ``words`` asks for one."""
-    return Loop(law, model, q0, period, **words) if words else law
+    return Loop(law, model, tracked, q0, period, **words) if words else law
 
 
 def _observer(kind: str, model: mujoco.MjModel, q0: Array, corner: float, counts: float) -> Observer | None:

@@ -23,7 +23,7 @@ from ..models import joint_names
 from ..sim.control import Target
 from ..sim.errors import PantographError, unknown
 from .basin import Catch, advance, comes_home
-from .gains import force_limits, positive
+from .gains import force_limits, number, positive, whole
 from .nominal import Nominal
 
 Array = NDArray[np.float64]
@@ -94,7 +94,8 @@ class SwingUp:
         self.nominal, self.a = Nominal(model), int(np.flatnonzero(tracked)[0])
         self.low, self.high = force_limits(model)
         self.foresight, self.every = positive("foresight", foresight, zero=True), positive("every", every)
-        self.tries, self.seed, self.room = int(positive("tries", tries)), seed, room
+        self.tries, self.seed = whole("tries", tries), whole("seed", seed, least=0)
+        self.room = positive("room", room, zero=True)
         if not np.isfinite(self.high[self.a] - self.low[self.a]):
             raise PantographError(
                 "swing-up needs to know what the drive can give: set the actuator's ctrlrange"

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models import lookup, names_of
-from ..sim.errors import PantographError, unknown
+from ..sim.errors import PantographError
+from .gains import choice
 
 Array = NDArray[np.float64]
 Axes = Literal["position", "pose"]
@@ -33,12 +34,10 @@ class Task:
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, axes: Axes) -> None:
-        if axes not in ("position", "pose"):
-            raise PantographError(unknown("axes", str(axes), ("position", "pose"), where="a task"))
-        if not site:
-            raise PantographError(
-                f"name the site to move: site = one of {', '.join(names_of(model, 'site'))}"
-            )
+        choice("axes", axes, ("position", "pose"), "a task")
+        if not (site and isinstance(site, str)):
+            sites = ", ".join(names_of(model, "site")) or "none: this model has no sites"
+            raise PantographError(f"name the site to move: site = one of {sites}")
         self.model, self.data = model, mujoco.MjData(model)
         self.site, self.k = lookup(model, "site", site), 3 if axes == "position" else 6
         self.body = int(model.site_bodyid[self.site])

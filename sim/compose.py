@@ -79,7 +79,7 @@ def make_law(
     reality = {word: value for word, value in parameters.items() if word in LOOP_WORDS}
     try:
         law = factory(*(offered[word] for word in needed), **own)
-        return with_reality(law, believed, problem.state0.q, period, reality)
+        return with_reality(law, believed, offered["tracked"], problem.state0.q, period, reality)
     except (TypeError, PantographError) as e:
         raise SceneError(str(e)) from e
 

@@ -290,6 +290,9 @@ def test_an_extended_filter_finds_the_speed_of_a_double_pendulum_far_from_rest()
     assert errors["extended"] < 0.1 * errors["fixed"]
 
 
+ALL = np.ones(2, dtype=bool)
+
+
 class _Echo:
     """A law that returns what it sees: positions first, then a count."""
 
@@ -303,7 +306,7 @@ class _Echo:
 @given(st.integers(0, 7), st.integers(1, 4096), seeds)
 def test_a_loop_delays_and_quantises(late, counts, seed):
     model, rng = load_model("double_pendulum"), np.random.default_rng(seed)
-    loop = Loop(_Echo(), model, model.qpos0, 0.01, delay=0.01 * late, encoder=counts)
+    loop = Loop(_Echo(), model, ALL, model.qpos0, 0.01, delay=0.01 * late, encoder=counts)
     memory, seen = loop.start(), rng.normal(size=(12, 2))
     target = Target(np.zeros(2), np.zeros(2), np.zeros(2))
     for k in range(12):
@@ -316,7 +319,7 @@ def test_a_loop_delays_and_quantises(late, counts, seed):
 @given(st.floats(1e-3, 0.5), seeds)
 def test_play_hides_at_most_half_its_width_and_no_motion_smaller_than_it(width, seed):
     model, rng = load_model("double_pendulum"), np.random.default_rng(seed)
-    loop = Loop(_Echo(), model, model.qpos0, 0.01, backlash=width)
+    loop = Loop(_Echo(), model, ALL, model.qpos0, 0.01, backlash=width)
     memory, q = loop.start(), np.zeros(2)
     target, shown = Target(np.zeros(2), np.zeros(2), np.zeros(2)), None
     for k in range(40):
@@ -331,7 +334,7 @@ def test_play_hides_at_most_half_its_width_and_no_motion_smaller_than_it(width, 
 
 def test_a_loop_cuts_forces_as_the_motor_does():
     model = _with_motor(force=8.0)
-    loop = Loop(_Echo(), model, model.qpos0, 0.01, saturation=0.5, top_speed=10.0, friction=0.0)
+    loop = Loop(_Echo(), model, ALL[:1], model.qpos0, 0.01, saturation=0.5, top_speed=10.0, friction=0.0)
     still = Target(np.zeros(1), np.zeros(1), np.zeros(1))
     for speed, asked, given_ in ((0, 9, 4), (5, 9, 2), (5, -9, -4), (-5, -9, -2), (12, 9, 0), (0, 1, 1)):
         tau, _ = loop(0.0, np.array([float(asked)]), np.array([float(speed)]), still, loop.start())

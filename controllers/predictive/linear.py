@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...sim.clip import Clip
 from ...sim.control import Target
-from ..gains import Gain, force_limits, per_joint, positive
+from ..gains import Gain, force_limits, limit_per_joint, positive, whole
 from ..lqr import LQR
 from .quadratic import NOTHING, LeastChange, Rows
 
@@ -58,7 +58,7 @@ class MPC:
     Looks ``horizon`` [s] ahead by the model's exact linearisation along the keys. Weights ``position``,
     ``velocity``, ``force`` and ``goal`` are LQR's. What drives can give is a hard limit, and so is ``slew``
     [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed`` [rad/s, m/s] are soft:
-    ``soft`` times the position's weight. The first ``fine`` moves take one period each, later ones 2, 4, 8,
+    the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one period each, later ones 2, 4, 8,
     ...; limits are looked at where moves meet.
     """
 
@@ -87,13 +87,12 @@ class MPC:
             position=position, velocity=velocity, force=force, goal=goal,
         )  # fmt: skip
         self.model, self.inputs, self.moving = model, np.flatnonzero(tracked), np.flatnonzero(~keyed)
-        self.powers = _moves(positive("the MPC's horizon", horizon), period, int(positive("fine", fine)))
+        self.powers = _moves(positive("the MPC's horizon", horizon), period, whole("the MPC's fine", fine))
         low, high = force_limits(model)
         self.low, self.high = low[self.inputs], high[self.inputs]
-        free = np.full(model.nv, np.inf)
-        self.slew = (free if slew is None else _limit(model, "slew", slew))[self.inputs] * period
+        self.slew = limit_per_joint(model, "the MPC's slew", slew)[self.inputs] * period
         ranges, limited = model.jnt_range[model.dof_jntid], model.jnt_limited[model.dof_jntid].astype(bool)
-        top = free if speed is None else _limit(model, "speed", speed)
+        top = limit_per_joint(model, "the MPC's speed", speed)
         self.x_low = np.concatenate(
             [np.where(limited, ranges[:, 0], -np.inf)[self.moving], -top[self.moving]]
         )
@@ -225,9 +224,3 @@ def _moves(horizon: float, period: float, fine: int) -> list[int]:
     while sum(2**k for k in powers[:-1]) >= ticks:
         powers.pop()
     return powers
-
-
-def _limit(model: mujoco.MjModel, what: str, value: Gain) -> Array:
-    """A limit (nv,) for each freedom: infinite for joints that are not named."""
-    out = per_joint(model, f"the MPC's {what}", value)
-    return np.where(out > 0.0, out, np.inf)
