@@ -29,6 +29,28 @@ def test_the_front_door_imports_nothing_heavy():
     assert done.stdout.split() == []
 
 
+def test_machine_code_waits_for_neither_scenes_nor_scipy():
+    code = "import sys, pantograph.sim.dynamics; "
+    code += "print(*sorted({'pydantic', 'scipy.optimize', 'scipy.interpolate', 'casadi'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == []
+
+
+def test_names_of_the_front_door_are_found_however_their_modules_were_imported():
+    code = """
+import importlib, pantograph.sim as sim
+for name in ("run", "shoot", "plan", "plots", "recording"):
+    importlib.import_module(f"pantograph.sim.{name}")
+found = {}
+exec("from pantograph.sim import *", found)
+assert set(sim.__all__) <= set(found) & set(dir(sim)), set(sim.__all__) - set(found)
+assert all(callable(found[name]) and getattr(sim, name) is found[name] for name in sim.__all__)
+assert sim.plan.make_plan is sim.make_plan
+assert not hasattr(sim, "fun")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+
+
 def test_versions_that_tests_run_with_satisfy_what_the_package_asks_for():
     from packaging.requirements import Requirement
 
