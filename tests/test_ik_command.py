@@ -2,6 +2,7 @@
 
 import pytest
 import typer
+from gl import needs_gl
 from pantograph.sim.cli.ik import ik
 from pantograph.sim.errors import PantographError
 from typer.testing import CliRunner
@@ -36,8 +37,8 @@ def test_feet_can_be_held_and_joints_named_by_patterns():
     assert code == 0 and "left_elbow" in text and "root" not in text and "waist" not in text
 
 
+@needs_gl
 def test_the_way_can_be_pictured(tmp_path):
-    pytest.importorskip("pyrender")
     code, _ = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
     assert code == 0
     assert (tmp_path / "pose.png").stat().st_size > 1000
