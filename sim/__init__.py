@@ -14,16 +14,9 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from .errors import EngineError, FilmError, ModelError, PantographError, RecordingError, RunError, SceneError
+
 if TYPE_CHECKING:
-    from .errors import (
-        EngineError,
-        FilmError,
-        ModelError,
-        PantographError,
-        RecordingError,
-        RunError,
-        SceneError,
-    )
     from .plan import Plan, make_plan
     from .plots import plot
     from .recording import ErrorEstimate, Recording, load
@@ -54,7 +47,6 @@ __all__ = [
 ]
 
 _HOME = {"plot": "plots", "run": "run", "shoot": "shoot", "Scene": "scene.schema"}
-_HOME |= dict.fromkeys([name for name in __all__ if name.endswith("Error")], "errors")
 _HOME |= dict.fromkeys(["Plan", "make_plan"], "plan")
 _HOME |= dict.fromkeys(["ErrorEstimate", "Recording", "load"], "recording")
 _HOME |= dict.fromkeys(["load_scene", "parse_scene"], "scene.load")
