@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import ik_cases
-from oracles.ik_motions import figure_eight, walk, wrist_arm
+from oracles.ik_motions import figure_eight, wrist_arm
 from pantograph.models import ModelError, load_model
 from pantograph.sim.ik import (
     Follower,
@@ -18,7 +18,6 @@ from pantograph.sim.ik import (
     Posture,
     blend,
     follow,
-    lock,
     soften,
     solve,
 )
@@ -338,34 +337,6 @@ def test_banded_programmes_agree_with_an_independent_solver(seed):
     assert cost(x.ravel()) <= found.fun + 1e-3 * abs(found.fun)
 
 
-def test_a_locked_foot_does_not_slide():
-    model, times = load_model("puppet"), np.arange(0, 1.5, 1 / 30)
-    q = walk(model, times)
-    stances = {"left_foot": [(0.2, 0.5)], "right_foot": [(0.7, 1.0)]}
-    locked = lock(model, times, q, stances)
-    for foot, ((start, end),) in stances.items():
-        on = (times >= start) & (times <= end)
-        places = frame(model, "site", foot).pose(locked.q)[on, :3, 3]
-        assert np.abs(places - places[0]).max() < 1e-4
-        loose = frame(model, "site", foot).pose(q)[on, :3, 3]
-        assert np.abs(loose - loose[0]).max() > 1e-3
-    away = (times < 0.05) | (times > 1.15)
-    np.testing.assert_allclose(locked.q[away], q[away], atol=1e-9)
-    assert all(ik_cases.illegal(model, x) == [] for x in locked.q)
-    assert np.abs(np.diff(locked.q, axis=0)).max() < 0.35
-
-
-def test_a_place_out_of_a_legs_reach_is_told():
-    model, times = load_model("puppet"), np.arange(0, 1, 1 / 10)
-    q = np.tile(model.qpos0, (len(times), 1))
-    q[:, 0] += np.linspace(-1, 1, len(times))
-    locked = lock(model, times, q, {"left_foot": [(0.0, 0.9)]})
-    assert not locked.met[0] and locked.slip[0] > 0.1
-    f = frame(model, "site", "left_foot").pose(locked.q)[:, :3, 3]
-    middle = np.argmin(np.abs(times - 0.45))
-    assert locked.slip[0] == pytest.approx(np.linalg.norm(f[0] - f[middle]), abs=1e-6)
-
-
 def test_the_pole_says_where_the_elbow_points():
     a, b = 0.4, 0.3
     links = [([0, 0, 0], ik_cases.BALL, (0, 0, 1), None), ([a, 0, 0], ik_cases.HINGE, (0, 0, 1), (0, 2.8))]
@@ -425,11 +396,7 @@ def test_mistakes_are_told():
         Posture([np.nan] * 6)
     with pytest.raises(ModelError, match=r"6 numbers \(nq\), not 2"):
         solve(model, Posture([0, 0]))
-    with pytest.raises(ModelError, match="3 x 6 finite"):
-        lock(model, [0, 0.1, 0.2], np.zeros((3, 5)), {"tip": [(0, 0.1)]})
     with pytest.raises(ModelError, match="share for each row"):
         blend(model, np.zeros((3, 6)), np.zeros((3, 6)), [0, 1])
-    with pytest.raises(ModelError, match="end after it starts"):
-        lock(model, [0, 1, 2], np.zeros((3, 6)), {"tip": [(1, 0)]})
     with pytest.raises(ModelError, match="below the reach"):
         soften([0, 0, 0], [1, 0, 0], 1.0, 2.0)

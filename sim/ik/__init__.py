@@ -6,9 +6,10 @@
 out of reach
 """
 
-from .animate import Locked, Pole, Spread, blend, lock, soften
+from .animate import Pole, Spread, blend, soften
 from .chains.solver import ChainSolver
 from .goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from .lock import Locked, Slide, lock
 from .loops import Loops, Projection
 from .solve import solve
 from .stream import Follower, Tick
@@ -37,6 +38,7 @@ __all__ = [
     "Posture",
     "Projection",
     "Residual",
+    "Slide",
     "Solution",
     "Spread",
     "Tick",

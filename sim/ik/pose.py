@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...models.naming import lookup, name_of
 from ..errors import ModelError
 from ..kinematics import Frame, FrameKind, frame
+from .space import Space
 
 Array = NDArray[np.float64]
 
@@ -55,6 +56,11 @@ class Kinematics:
     @cached_property
     def _data(self) -> mujoco.MjData:
         return mujoco.MjData(self.model)
+
+    @cached_property
+    def space(self) -> Space:
+        """Configurations of the model."""
+        return Space(self.model)
 
     def alone(self) -> Kinematics:
         """The same frames, for somebody else."""
