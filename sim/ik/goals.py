@@ -62,12 +62,8 @@ class Goal(ABC):
         """Frames that the goal looks at."""
 
     @abstractmethod
-    def units(self) -> tuple[Unit, ...]:
-        """Unit of every row before rows are left free."""
-
-    def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
-        """Unit of every row on `model`; differs from `units` for goals whose rows follow from the model."""
-        return self.units()
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
+        """Unit of every row on `model`."""
 
     @abstractmethod
     def rows(self, c: Configurations) -> Rows:
@@ -80,21 +76,20 @@ class Goal(ABC):
             mask[kinematics.frame(text).dofs] = True
         return mask
 
-    def tolerances(self) -> Array:
+    def tolerances(self, model: mujoco.MjModel) -> Array:
         """Tolerance of every row (m,)."""
-        m = len(self.units())
+        m = len(self.units(model))
         t = np.asarray(self.tolerance, dtype=float)
         if t.ndim and t.shape != (m,):
-            raise ModelError(f"goal {self.label!r} has {m} rows; its tolerance has shape {t.shape}")
+            raise ModelError(
+                f"goal {self.label!r} has {m} rows: one tolerance or {m}, not of shape {t.shape}"
+            )
         return np.broadcast_to(t, (m,))
 
-    def errors(self, r: Array) -> tuple[Array, Array]:
+    def errors(self, r: Array, model: mujoco.MjModel) -> tuple[Array, Array]:
         """Size of residuals (n, m): (n,) in metres and (n,) in radians, free rows left out."""
-        if len(self.units()) == 1:
-            size = _norm(r)
-            return (size, np.zeros(len(r))) if self.units()[0] == "m" else (np.zeros(len(r)), size)
-        kept = np.isfinite(self.tolerances())
-        metres = np.array([u == "m" for u in self.units()])
+        kept = np.isfinite(self.tolerances(model))
+        metres = np.array([u == "m" for u in self.units(model)], dtype=bool)
         return _norm(r[:, metres & kept]), _norm(r[:, ~metres & kept])
 
 
@@ -145,7 +140,7 @@ class Position(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",) * 3
 
     def rows(self, c: Configurations) -> Rows:
@@ -176,7 +171,7 @@ class Orientation(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
@@ -211,7 +206,7 @@ class Pose(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",) * 3 + ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
@@ -243,7 +238,7 @@ class LookAt(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
@@ -259,7 +254,7 @@ class LookAt(Goal):
         Jd = (J - d[:, :, None] * (d[:, None, :] @ J)) / far[:, :, None]
         return Rows(a - d, -rotations.skew(a) @ f.Jw - Jd)
 
-    def errors(self, r: Array) -> tuple[Array, Array]:
+    def errors(self, r: Array, model: mujoco.MjModel) -> tuple[Array, Array]:
         return np.zeros(len(r)), 2 * np.arcsin(np.minimum(1.0, 0.5 * _norm(r)))
 
 
@@ -279,7 +274,7 @@ class PointOnLine(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",) * 2
 
     def rows(self, c: Configurations) -> Rows:
@@ -304,7 +299,7 @@ class PointOnPlane(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at,)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",)
 
     def rows(self, c: Configurations) -> Rows:
@@ -330,7 +325,7 @@ class Distance(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.to) if isinstance(self.to, str) else (self.at,)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",)
 
     def rows(self, c: Configurations) -> Rows:
@@ -376,7 +371,7 @@ class Mirror(Goal):
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.of) if self.relative_to is None else (self.at, self.of, self.relative_to)
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         place: tuple[Unit, ...] = ("m",) * 3
         turn: tuple[Unit, ...] = ("rad",) * 3
         return {"position": place, "orientation": turn, "pose": place + turn}[self.what]

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...models.naming import name_of
 from .. import rotations
+from ..kinds import SLIDE
 from .goals import Rows
 from .pose import Configurations, Kinematics
 from .space import Space
@@ -100,7 +101,8 @@ def _joint_closure(model: mujoco.MjModel, label: str, e: int, data: Array) -> Cl
     moved[[v for _, v, _ in joints]] = True
     label = label if not label.startswith("equality") else f"coupling of {name_of(model, 'joint', ids[0])}"
     polynomial = tuple(float(x) for x in data[:5])
-    return Closure(label, JOINT, moved, np.array([False]), np.array([CLOSED]), "", "", joints, polynomial)
+    metres = np.array([int(model.jnt_type[ids[0]]) == SLIDE])
+    return Closure(label, JOINT, moved, metres, np.array([CLOSED]), "", "", joints, polynomial)
 
 
 def _meeting_frames(model: mujoco.MjModel, kinematics: Kinematics, e: int, data: Array) -> tuple[str, str]:

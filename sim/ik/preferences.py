@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +23,31 @@ PREFERENCES: tuple[Preference, ...] = ("near", "middle", "manipulability", "clea
 FAINT = 1e-4  # preferences beside wishes: rows this much smaller
 
 
+def chosen(prefer: str | None, obstacles: Sequence[tuple[str, str]]) -> str:
+    """The preference meant: what was asked for, or clear of obstacles where there are some, or near."""
+    if prefer is None:
+        return "clear" if obstacles else "near"
+    if prefer not in PREFERENCES:
+        raise ModelError(unknown("preference", prefer, PREFERENCES, where="inverse kinematics"))
+    if obstacles and prefer != "clear":
+        raise ModelError(f"obstacles are kept away from by the preference 'clear', not by {prefer!r}")
+    return prefer
+
+
+def closest(model: mujoco.MjModel, obstacles: Sequence[tuple[str, str]], q: Array) -> str:
+    """How near the nearest pair of obstacles is at q (nq,), in words; empty without obstacles."""
+    if not obstacles:
+        return ""
+    clearance = Clearance(model, obstacles)
+    distance, (a, b) = min(
+        (gap.distance, pair) for gap, pair in zip(clearance.gaps(q), obstacles, strict=True)
+    )
+    if distance >= clearance.reach:
+        return f"; obstacles at least {clearance.reach:g} m away"
+    how = f"overlap by {-distance:.3g} m" if distance < 0 else f"are {distance:.3g} m apart"
+    return f"; {a} and {b} {how}"
+
+
 def wishes(problem: Problem, prefer: Wish) -> Wish:
     """Rows of a problem of weighted goals, and faintly those of a preference."""
 
@@ -36,8 +62,6 @@ def wishes(problem: Problem, prefer: Wish) -> Wish:
 
 def preference(kind: str, problem: Problem, q0: Array, obstacles: Sequence[tuple[str, str]] = ()) -> Wish:
     """Rows of a preference: near `q0`, mid-range, well-conditioned, or clear of obstacles."""
-    if kind not in PREFERENCES:
-        raise ModelError(unknown("preference", kind, PREFERENCES, where="inverse kinematics"))
     near = _near(problem, q0)
     if kind == "near":
         return near

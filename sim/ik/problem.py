@@ -73,11 +73,8 @@ class Problem:
         groups, judged, tolerance, weight, band, metres = [], [], [], [], [], []
         at = 0
         for goal, judge in zip(self.goals, strict, strict=True):
-            t = goal.tolerances()
-            row_units = goal.row_units(self.model)
-            is_metres = np.array([u == "m" for u in row_units])
-            if len(t) != len(row_units):
-                t = np.full(len(row_units), t[0])
+            t = goal.tolerances(self.model)
+            is_metres = np.array([u == "m" for u in goal.units(self.model)], dtype=bool)
             units = np.where(is_metres, 1.0 / scale, 1.0)
             groups.append(Group(goal.label, goal, slice(at, at + len(t))))
             metres.append(is_metres)
@@ -153,6 +150,13 @@ class Problem:
         """The same model and freedoms with other goals."""
         out = Problem(self.model, goals, self.space, kinematics=self.kinematics)
         out.moved &= self.moved
+        return out
+
+    def closures(self) -> Problem:
+        """The model's equalities alone."""
+        out = copy(self)
+        out.goals, out.wished = (), None
+        out._layout()
         return out
 
     def aimed(self, goals: Sequence[Goal]) -> Problem:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .chains.closed_form import candidates
+from ..errors import ModelError
+from .chains.closed_form import ClosedForm, closed_form
 from .goals import Goal
-from .numeric.descend import Descent, sharpen, tighten
-from .numeric.search import Search
+from .numeric.descend import Descent, tighten
+from .numeric.nearest import settle_nearest, sharpen
+from .numeric.search import AT_LIMIT, Search
 from .numeric.settle import Settled, Wish, settle, settle_near, worth
-from .preferences import FAINT, Preference, preference, wishes
+from .preferences import FAINT, Preference, chosen, closest, preference, wishes
 from .problem import Problem, asked, unwound
 from .proofs.diagnose import diagnose, excluded
 from .space import Space
@@ -30,7 +33,7 @@ def solve(
     *,
     q0: ArrayLike | None = None,
     joints: Sequence[str] | None = None,
-    prefer: Preference = "near",
+    prefer: Preference | None = None,
     obstacles: Sequence[tuple[str, str]] = (),
     restarts: int = 200,
     seed: int = 0,
@@ -48,42 +51,83 @@ def solve(
         q0: where to start (nq,), and what "near" means; default the model's qpos0.
         joints: names of the joints that may move; default all that the goals depend on.
         prefer: what decides between answers: "near" q0, "middle" of the ranges, "manipulability", or "clear"
-            of `obstacles`.
-        obstacles: pairs of geoms for "clear".
-        restarts: random starts before giving up; `seed` makes them repeatable.
-        all: list distinct solutions.
+            of `obstacles`; default near, or clear where there are obstacles.
+        obstacles: pairs of geoms to keep apart as far as the goals allow.
+        restarts: random starts at most, besides q0 and mid-range; 0 for none.
+        seed: of the random starts, not negative. The same seed gives the same starts, and the same answer bit
+            for bit from the same code (machine code, or NumPy).
+        all: list distinct solutions, and whether these are all (`Solution.complete`).
 
     Raises ModelError for goals or names that do not fit the model.
     """
     begin = time.perf_counter()
     goals = (goals,) if isinstance(goals, Goal) else tuple(goals)
+    _check(goals, restarts, seed)
     judged, wished = asked(model, goals, joints)
     start = judged.space.check(model.qpos0 if q0 is None else q0)
-    prefers = preference(prefer, judged, start, obstacles)
+    kind = chosen(prefer, obstacles)
+    prefers = preference(kind, judged, start, obstacles)
     wish: Wish = prefers if wished is None else wishes(wished, prefers)
-    search = Search(judged, start, restarts=restarts, seed=seed, hopeless=lambda: excluded(judged, start))
-    found = search.solutions(candidates(judged, start))
-    if len(found) and (all or prefer != "near"):  # what is best may lie far from the start
-        found = np.concatenate([found, search.more(restarts if all else min(restarts, 40))])
+    near = kind == "near"
+    search = Search(judged, start, restarts=restarts, seed=(seed,), hopeless=lambda: excluded(judged, start))
+    form = closed_form(judged, start)
+    found = search.solutions(np.zeros((0, judged.space.nq)) if form is None else form.q)
+    if len(found) and (all or not near):  # what is best may lie far from the start
+        found = np.concatenate([found, search.more(restarts if all else 40)])
+    if not len(found):
+        nearest = _nearest(judged, search.best)
+        reason = diagnose(judged, search, nearest)
+        found = reason.found
     if len(found):
-        best = _settled(judged, found, wish, start, every=all, near=prefer == "near")
-        verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
-        return _solution(judged, goals, best[0], verdict, best if all else best[:1], None, search, begin)
-    nearest = _nearest(judged, search.best)
-    if nearest.met[0]:  # a slow end, as at a singular boundary, got there after all
-        verdict = Verdict("solved", True, _solved_words(judged, nearest.q), restarts=search.used)
-        return _solution(judged, goals, nearest.q[0], verdict, nearest.q, None, search, begin)
-    diagnosis = diagnose(judged, search, nearest)
-    if diagnosis.found is not None:
-        best = _settled(judged, diagnosis.found[None], wish, start, every=False, near=prefer == "near")
-        verdict = Verdict("solved", True, _solved_words(judged, best), restarts=search.used)
-        return _solution(judged, goals, best[0], verdict, best, None, search, begin)
-    q = diagnosis.nearest
-    if wished is not None:
-        q = nearest.q[0] if q is None else q
-    answer = unwound(judged, nearest.q if q is None else q[None], start)[0]
-    none = answer[:0].reshape(0, 0)
-    return _solution(judged, goals, answer, diagnosis.verdict, none, diagnosis.q_free, search, begin)
+        best = _settled(judged, found, wish, start, every=all, near=near)
+        complete = all and _listed(judged, form, best)
+        words = _solved_words(judged, best) + (_listed_words(judged, best, complete) if all else "")
+        verdict = Verdict("solved", True, words + closest(model, obstacles, best[0]))
+        answer = _Answer(best[0], verdict, best if all else best[:1], complete)
+    else:
+        q = unwound(judged, settle_nearest(judged, nearest, wish)[None], start)[0]
+        answer = _Answer(q, reason.verdict, found, all and reason.verdict.proved, reason.q_free)
+    return _solution(judged, goals, answer, search, begin)
+
+
+class _Answer(NamedTuple):
+    """What goes into a `Solution`: see there."""
+
+    q: Array
+    verdict: Verdict
+    solutions: Array
+    complete: bool
+    free: Array | None = None
+
+
+def _check(goals: Sequence[Goal], restarts: int, seed: int) -> None:
+    for goal in goals:
+        if not isinstance(goal, Goal):
+            raise ModelError(f"a goal is a Position, a Pose, ... of pantograph.sim.ik, not {goal!r:.100}")
+    for name, number in (("restarts", restarts), ("seed", seed)):
+        if not isinstance(number, (int, np.integer)) or number < 0:
+            raise ModelError(f"{name} must be a whole number, not negative, not {number!r}")
+
+
+def _listed(problem: Problem, form: ClosedForm | None, found: Array) -> bool:
+    """Whether solutions `found` (k, nq) are all: a complete closed form has no other inside limits."""
+    if form is None or not form.complete or (problem.band > 0).any():
+        return False
+    q = problem.space.clip(form.q[problem.space.excess(form.q).max(axis=1, initial=0.0) <= AT_LIMIT])
+    return len(distinct(problem.space, q[problem.met(problem.raw(q).r)])) <= len(found)
+
+
+def _listed_words(problem: Problem, found: Array, complete: bool) -> str:
+    """How many solutions there are."""
+    count = f"{len(found)} solution{'s' * (len(found) > 1)}"
+    if complete:
+        return f"; {count}, all there are but for whole turns, by a closed form"
+    J = problem.weighted(problem.raw(found[:1])).J[0][problem.judged]
+    free = int(problem.moved.sum()) - np.linalg.matrix_rank(J[:, problem.moved], tol=1e-7)
+    if free > 0:
+        left = "1 freedom is" if free == 1 else f"{free} freedoms are"
+        return f"; {left} left, of the continuum of solutions {count} where restarts ended are listed"
+    return f"; {count} found, not proved to be all"
 
 
 def _settled(judged: Problem, found: Array, wish: Wish, start: Array, *, every: bool, near: bool) -> Array:
@@ -143,7 +187,7 @@ def _residuals(problem: Problem, r: Array) -> tuple[Residual, ...]:
     for group in problem.groups:
         part, tolerance = r[:, group.rows], problem.tolerance[group.rows]
         if group.goal is not None:
-            position, rotation = group.goal.errors(part)
+            position, rotation = group.goal.errors(part, problem.model)
         else:
             metres = problem.metres[group.rows]
             position, rotation = (np.linalg.norm(part[:, m], axis=1) for m in (metres, ~metres))
@@ -162,21 +206,14 @@ def _all_residuals(judged: Problem, goals: Sequence[Goal], q: Array) -> tuple[Re
 
 
 def _solution(
-    judged: Problem,
-    goals: Sequence[Goal],
-    q: Array,
-    verdict: Verdict,
-    solutions: Array,
-    free: Array | None,
-    search: Search,
-    begin: float,
+    judged: Problem, goals: Sequence[Goal], answer: _Answer, search: Search, begin: float
 ) -> Solution:
-    arrays = [np.array(q), np.array(solutions)] + ([] if free is None else [np.array(free)])
-    for array in arrays:
+    q, solutions = np.array(answer.q), np.array(answer.solutions)
+    free = None if answer.free is None else np.array(answer.free)
+    for array in (q, solutions, *(() if free is None else (free,))):
         array.setflags(write=False)
-    seconds = time.perf_counter() - begin
-    verdict = replace(verdict, restarts=search.used)
+    verdict = replace(answer.verdict, restarts=search.used)
     return Solution(
-        arrays[0], _all_residuals(judged, goals, q), verdict, arrays[1], None if free is None else arrays[2],
-        search.iterations, search.used, seconds,
+        q, _all_residuals(judged, goals, q), verdict, solutions, answer.complete, free,
+        search.iterations, search.used, time.perf_counter() - begin,
     )  # fmt: skip

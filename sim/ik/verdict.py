@@ -63,7 +63,11 @@ class Solution:
         q (nq,): within limits always; the nearest pose found when the goals cannot be met.
         residuals: of every goal and touched loop of the model.
         verdict: see `Verdict`.
-        solutions (k, nq): distinct solutions (whole turns apart count as one), best first; only with `all`.
+        solutions (k, nq): distinct solutions, best first: the answer alone, or with `all` every one that was
+            found. Those that differ by whole turns of hinges, or by less than 1e-3 in every freedom, count as
+            one, told with the turns nearest to q0.
+        complete: whether `solutions` are certainly all, by a closed form or by a proof that there is none.
+            Only with `all`; otherwise, and for a continuum of solutions, False.
         q_free (nq,): a solution that leaves the limits, when limits are the reason; otherwise None.
         iterations: of damped least squares over all starts; restarts: random starts used; seconds: wall time.
     """
@@ -72,6 +76,7 @@ class Solution:
     residuals: tuple[Residual, ...]
     verdict: Verdict
     solutions: Array
+    complete: bool
     q_free: Array | None
     iterations: int
     restarts: int

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from ...models.naming import lookup
 from .. import rotations
 from ..errors import ModelError
-from ..kinds import SCALAR
+from ..kinds import FREE, SCALAR, SLIDE
 from .goals import Goal, Rows, Unit, vector
 from .pose import Configurations, Kinematics
-from .space import Space
 
 Array = NDArray[np.float64]
 
@@ -37,7 +36,7 @@ class CenterOfMass(Goal):
     def frames(self) -> tuple[str, ...]:
         return ()
 
-    def units(self) -> tuple[Unit, ...]:
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",) * 3
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
@@ -70,24 +69,33 @@ class JointValue(Goal):
     def frames(self) -> tuple[str, ...]:
         return ()
 
-    def units(self) -> tuple[Unit, ...]:
-        return ("rad",)
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
+        return (freedom_units(model)[scalar_joint(model, self.joint)[1]],)
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         mask = np.zeros(kinematics.model.nv, dtype=bool)
-        mask[scalar_joint(kinematics, self.joint)[1]] = True
+        mask[scalar_joint(kinematics.model, self.joint)[1]] = True
         return mask
 
     def rows(self, c: Configurations) -> Rows:
-        q, v = scalar_joint(c.kinematics, self.joint)
+        q, v = scalar_joint(c.model, self.joint)
         J = np.zeros((len(c.q), 1, c.model.nv))
         J[:, 0, v] = 1.0
         return Rows(c.q[:, q : q + 1] - self.value, J)
 
 
-def scalar_joint(kinematics: Kinematics, name: str) -> tuple[int, int]:
+def freedom_units(model: mujoco.MjModel) -> tuple[Unit, ...]:
+    """Unit of every freedom (nv): metres of slides and of the places of free joints, else radians."""
+    out: list[Unit] = ["rad"] * int(model.nv)
+    for kind, v in zip(model.jnt_type, model.jnt_dofadr, strict=True):
+        if int(kind) in (SLIDE, FREE):
+            n = 1 if int(kind) == SLIDE else 3
+            out[v : v + n] = ["m"] * n
+    return tuple(out)
+
+
+def scalar_joint(model: mujoco.MjModel, name: str) -> tuple[int, int]:
     """Addresses in q and v of a hinge or slide; ModelError for other joints."""
-    model = kinematics.model
     j = lookup(model, "joint", name)
     if int(model.jnt_type[j]) not in SCALAR:
         raise ModelError(f"joint {name!r} is no hinge or slide: it has no single value")
@@ -114,12 +122,8 @@ class Posture(Goal):
     def frames(self) -> tuple[str, ...]:
         return ()
 
-    def units(self) -> tuple[Unit, ...]:
-        return ("rad",)
-
-    def row_units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
-        unit: Unit = "rad"
-        return (unit,) * int(model.nv)
+    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
+        return freedom_units(model)
 
     def moved(self, kinematics: Kinematics) -> NDArray[np.bool_]:
         if len(np.asarray(self.q)) != kinematics.model.nq:
@@ -128,10 +132,9 @@ class Posture(Goal):
         return np.ones(kinematics.model.nv, dtype=bool)
 
     def rows(self, c: Configurations) -> Rows:
-        space = Space(c.model)
+        space = c.kinematics.space
         d = space.difference(c.q, np.asarray(self.q, dtype=float)[None])
         J = np.tile(np.eye(c.model.nv), (len(d), 1, 1))
-        for ball in space.balls:
-            v = slice(ball.v, ball.v + 3)
-            J[:, v, v] = rotations.inverse_right_jacobian(d[:, v])
+        v = space.turns
+        J[:, v[:, :, None], v[:, None, :]] = rotations.inverse_right_jacobian(d[:, v])
         return Rows(d, J)

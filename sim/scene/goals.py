@@ -238,7 +238,7 @@ def deviations(scene: Scene, model: mujoco.MjModel, t: Array, q: Array) -> dict[
     for x, row in zip(t, q, strict=True):
         c = kinematics.at(row[None])
         for goal in goals(float(x)):
-            position, rotation = goal.errors(goal.rows(c).r)
+            position, rotation = goal.errors(goal.rows(c).r, model)
             out.setdefault(goal.label, []).append((float(position[0]), float(rotation[0])))
     return {label: np.array(rows) for label, rows in out.items()}
 

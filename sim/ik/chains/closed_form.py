@@ -36,7 +36,7 @@ _SWIVELS = 12
 
 
 class ClosedForm(NamedTuple):
-    """All solutions q (k, nq) without regard to limits.
+    """All solutions q (k, nq) without regard to limits, but with the whole turns that fit them.
 
     `complete`: these are certainly all; `structure`: what was recognised.
     """
@@ -61,7 +61,7 @@ def closed_form(problem: Problem, start: Array) -> ClosedForm | None:
     goal = problem.goals[0]
     if not isinstance(goal, (Position, Pose)) or goal.relative_to is not None:
         return None
-    if not np.isfinite(goal.tolerances()).all():
+    if not np.isfinite(goal.tolerances(problem.model)).all():
         return None
     chain = _chain(problem.kinematics.frame(goal.at), problem, start)
     if chain is None:
@@ -77,12 +77,6 @@ def closed_form(problem: Problem, start: Array) -> ClosedForm | None:
         return None
     q = [_placed(problem, chain, angles, start) for angles in found[0]]
     return ClosedForm(np.array(q).reshape(-1, problem.space.nq), found[1], found[2])
-
-
-def candidates(problem: Problem, start: Array) -> Array:
-    """Configurations (k, nq) of the closed form, if any, with whole turns chosen to fit the limits."""
-    found = closed_form(problem, start)
-    return np.zeros((0, problem.space.nq)) if found is None else found.q
 
 
 def _chain(f: Frame, problem: Problem, start: Array) -> _Chain | None:

@@ -1,7 +1,7 @@
 """Searches side by side in SIMD lanes, whole in machine code: the first lane that meets the target ends it.
 
 Lane 0 starts at the given seed, the others at rows of a table of random configurations. A lane that has not
-come nearer for a while takes the next row.
+come nearer for a while takes the next row; when no more may be taken it rests, and when all rest it is over.
 """
 
 from __future__ import annotations
@@ -27,26 +27,32 @@ Array = NDArray[np.float64]
 _ROWS = 4096
 _PATIENCE = 6.0  # iterations without progress that end a lane's attempt
 _PROGRESS = 0.95
+_ENDLESS = 2**62
 
 
 class Raced(NamedTuple):
-    """Configurations q (k, n), whether each meets its target, and iterations of all lanes spent on it."""
+    """Configurations q (k, n), whether each meets its target, iterations of all lanes spent on it, and how
+    many rows of the table were started from."""
 
     q: Array
     met: NDArray[np.bool_]
     iterations: NDArray[np.int64]
+    starts: NDArray[np.int64]
 
 
 def race_loop(chain: Chain, lanes: int) -> str:
-    """IR of `void race(i64 k, seeds, targets, table, i64 rows, i64 most, q, iterations)` over k targets.
+    """IR of `void race(i64 k, seeds, targets, table, i64 rows, i64 limit, i64 most, q, iterations, starts)`.
 
-    `iterations` gets the count, negative when the target was not met within `most`.
+    Over k targets; for each at most `limit` rows of the table, from its start again after its end, and `most`
+    iterations. `iterations` gets the count, negative when the target was not met.
     """
     e = Emitter(lanes)
     n = chain.n
     Q, N, T, ERR = (e.slot(size) for size in (n, n, 14, 1))
     BEST, STALL = e.slot(1), e.slot(1)
-    NEXT, COUNT = e.slot(1, "i64"), e.slot(1, "i64")
+    NEXT, COUNT, LIVE = (e.slot(1, "i64") for _ in range(3))
+    few = e.emit(f"icmp slt i64 %limit, {lanes - 1}")
+    first = e.emit(f"select i1 {few}, i64 %limit, i64 {lanes - 1}")
     with e.loop("%k") as at:
         seed = e.element("%seeds", e.emit(f"mul nsw i64 {at}, {n}"), "double")
         target = e.element("%targets", e.emit(f"mul nsw i64 {at}, 14"), "double")
@@ -54,17 +60,23 @@ def race_loop(chain: Chain, lanes: int) -> str:
         with e.loop(14) as i:
             x = e.emit(f"load double, ptr {e.element(target, i, 'double')}, align 8")
             e.store(e.splat(x), T, i)
-        for lane in range(lanes):
-            row = seed if lane == 0 else e.element("%table", (lane - 1) * n, "double")
-            _fill(e, row, Q, lane, n)
-        e.do(f"store i64 {lanes - 1}, ptr {NEXT}")
         e.store(e.const(1e300), BEST, 0)
         e.store(e.const(0.0), STALL, 0)
-        _until_met(e, lanes, n, (Q, N, T, ERR, BEST, STALL, NEXT, COUNT), result)
-        count = e.emit(f"load i64, ptr {COUNT}")
-        e.do(f"store i64 {count}, ptr {e.element('%iterations', at, 'i64')}")
+        _fill(e, seed, Q, 0, n)
+        for lane in range(1, lanes):
+            has = e.emit(f"icmp slt i64 {lane - 1}, %limit")
+            row = e.element("%table", (lane - 1) * n, "double")
+            _fill(e, e.emit(f"select i1 {has}, ptr {row}, ptr {seed}"), Q, lane, n)
+            with e.when(e.emit(f"xor i1 {has}, true")):
+                _rest(e, lane, BEST, STALL)
+        e.do(f"store i64 {first}, ptr {NEXT}")
+        e.do(f"store i64 {e.emit(f'add nsw i64 {first}, 1')}, ptr {LIVE}")
+        _until_met(e, lanes, n, (Q, N, T, ERR, BEST, STALL, NEXT, COUNT, LIVE), result)
+        for slot, name in ((COUNT, "%iterations"), (NEXT, "%starts")):
+            e.do(f"store i64 {e.emit(f'load i64, ptr {slot}')}, ptr {e.element(name, at, 'i64')}")
     arguments = ["i64 %k", "ptr noalias %seeds", "ptr noalias %targets", "ptr noalias %table", "i64 %rows",
-                 "i64 %most", "ptr noalias %q", "ptr noalias %iterations"]  # fmt: skip
+                 "i64 %limit", "i64 %most", "ptr noalias %q", "ptr noalias %iterations",
+                 "ptr noalias %starts"]  # fmt: skip
     return function("race", arguments, e)
 
 
@@ -77,7 +89,7 @@ def _fill(e: Emitter, row: str, Q: str, lane: int | str, n: int) -> None:
 
 def _until_met(e: Emitter, lanes: int, n: int, buffers: tuple[str, ...], result: str) -> None:
     """The iterations of one target: step, look for a lane that met it, restart lanes that stall."""
-    Q, N, T, ERR, BEST, STALL, NEXT, COUNT = buffers
+    Q, N, T, ERR, BEST, STALL, NEXT, COUNT, LIVE = buffers
     name = e.fresh()[1:]
     e.do(f"br label %{name}.entry")
     e.lines.append(f"{name}.entry:")
@@ -105,9 +117,11 @@ def _until_met(e: Emitter, lanes: int, n: int, buffers: tuple[str, ...], result:
         shift = e.emit(f"trunc i64 {lane} to i{lanes}")
         bit = e.emit(f"trunc i{lanes} {e.emit(f'lshr i{lanes} {tired_bits}, {shift}')} to i1")
         with e.when(bit):
-            _restart(e, lane, n, Q, BEST, STALL, NEXT)
+            _restart(e, lane, n, Q, BEST, STALL, NEXT, LIVE)
     e.do(f"%{name}.next = add nsw i64 {i}, 1")
-    e.do(f"%{name}.more = icmp slt i64 %{name}.next, %most")
+    e.do(f"%{name}.some = icmp sgt i64 {e.emit(f'load i64, ptr {LIVE}')}, 0")
+    e.do(f"%{name}.few = icmp slt i64 %{name}.next, %most")
+    e.do(f"%{name}.more = and i1 %{name}.some, %{name}.few")
     e.do(f"br i1 %{name}.more, label %{name}.again, label %{name}.failed")
     e.lines.append(f"{name}.again:")
     e.do(f"br label %{name}.body")
@@ -124,20 +138,31 @@ def _until_met(e: Emitter, lanes: int, n: int, buffers: tuple[str, ...], result:
     with e.loop(n) as k:
         x = e.emit(f"load double, ptr {e.element(e.element(Q, k), 0, 'double')}, align 8")
         e.do(f"store double {x}, ptr {e.element(result, k, 'double')}, align 8")
-    e.do(f"store i64 {e.emit('sub nsw i64 0, %most')}, ptr {COUNT}")
+    e.do(f"store i64 {e.emit(f'sub nsw i64 0, %{name}.next')}, ptr {COUNT}")
     e.do(f"br label %{name}.end")
     e.lines.append(f"{name}.end:")
 
 
-def _restart(e: Emitter, lane: str, n: int, Q: str, BEST: str, STALL: str, NEXT: str) -> None:
-    """The next row of the table (from its start again after its end) into a lane."""
+def _restart(e: Emitter, lane: str, n: int, Q: str, BEST: str, STALL: str, NEXT: str, LIVE: str) -> None:
+    """The next row of the table into a lane, or rest for it."""
     at = e.emit(f"load i64, ptr {NEXT}")
-    row = e.element("%table", e.emit(f"mul nsw i64 {at}, {n}"), "double")
-    _fill(e, row, Q, lane, n)
-    following = e.emit(f"add nsw i64 {at}, 1")
-    e.do(f"store i64 {e.emit(f'srem i64 {following}, %rows')}, ptr {NEXT}")
-    e.do(f"store double {double(1e300)}, ptr {e.element(BEST, lane, 'double')}, align 8")
-    e.do(f"store double {double(0.0)}, ptr {e.element(STALL, lane, 'double')}, align 8")
+    has = e.emit(f"icmp slt i64 {at}, %limit")
+    with e.when(has):
+        row = e.emit(f"srem i64 {at}, %rows")
+        _fill(e, e.element("%table", e.emit(f"mul nsw i64 {row}, {n}"), "double"), Q, lane, n)
+        e.do(f"store i64 {e.emit(f'add nsw i64 {at}, 1')}, ptr {NEXT}")
+        e.do(f"store double {double(1e300)}, ptr {e.element(BEST, lane, 'double')}, align 8")
+        e.do(f"store double {double(0.0)}, ptr {e.element(STALL, lane, 'double')}, align 8")
+    with e.when(e.emit(f"xor i1 {has}, true")):
+        _rest(e, lane, BEST, STALL)
+        live = e.emit(f"load i64, ptr {LIVE}")
+        e.do(f"store i64 {e.emit(f'sub nsw i64 {live}, 1')}, ptr {LIVE}")
+
+
+def _rest(e: Emitter, lane: str | int, BEST: str, STALL: str) -> None:
+    """A lane that never comes nearer than it was, and never tires of that."""
+    for slot in (BEST, STALL):
+        e.do(f"store double {double(-1e300)}, ptr {e.element(slot, lane, 'double')}, align 8")
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,23 +186,27 @@ class Racer:
         *,
         tolerance: tuple[float, float],
         most: int = 4000,
+        starts: Array | None = None,
     ) -> Raced:
         """Configurations (k, n) for targets R (k, 3, 3), p (k, 3), from `seeds` (k, n).
 
         `tolerance` of every component of position [m] and rotation [rad]; at most `most` iterations a target.
+        `starts` (rows, n): all further starts that may be made; default those of `table`, again and again.
         """
         p = np.asarray(p, dtype=float).reshape(-1, 3)
         k = len(p)
         targets = np.empty((k, 14))
         targets[:, :9] = np.asarray(R, dtype=float).reshape(-1, 9)
         targets[:, 9:12], targets[:, 12:] = p, tolerance
-        starts = np.ascontiguousarray(np.broadcast_to(np.asarray(seeds, dtype=float), (k, self.chain.n)))
-        q, iterations = np.empty((k, self.chain.n)), np.empty(k, dtype=np.int64)
+        first = np.ascontiguousarray(np.broadcast_to(np.asarray(seeds, dtype=float), (k, self.chain.n)))
+        table = self.table if starts is None else np.ascontiguousarray(starts, dtype=float)
+        q, (iterations, taken) = np.empty((k, self.chain.n)), np.empty((2, k), dtype=np.int64)
         self.call(
-            k, address(starts), address(targets), address(self.table), len(self.table), most, address(q),
-            iterations.__array_interface__["data"][0],
+            k, address(first), address(targets), address(table), max(len(table), 1),
+            _ENDLESS if starts is None else len(table), most, address(q),
+            iterations.__array_interface__["data"][0], taken.__array_interface__["data"][0],
         )  # fmt: skip
-        return Raced(q, iterations > 0, np.abs(iterations))
+        return Raced(q, iterations > 0, np.abs(iterations), taken)
 
 
 @lru_cache(maxsize=1)
@@ -213,7 +242,7 @@ def racer(chain: Chain, *, seed: int = 0, cache: bool = True, lanes: int | None 
     key = key_of(chain.fingerprint(), _source(), str(lanes), repr((jit.host(), jit.llvm_version())))
     code = obtain("race", lanes, Cache(default_folder() if cache else None), key, make)
     p, i = ctypes.c_void_p, ctypes.c_int64
-    return Racer(chain, lanes, table, code.build, code.loaded.function("race", i, p, p, p, i, i, p, p))
+    return Racer(chain, lanes, table, code.build, code.loaded.function("race", i, p, p, p, i, i, i, p, p, p))
 
 
 def _ranges(chain: Chain) -> tuple[Array, Array]:

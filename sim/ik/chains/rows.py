@@ -225,7 +225,7 @@ def _center(scene: Scene, goal: CenterOfMass, t: Vector) -> list[Row]:
 
 
 def _joint_value(scene: Scene, goal: JointValue, t: Vector) -> list[Row]:
-    q, v = scalar_joint(scene.problem.kinematics, goal.joint)
+    q, v = scalar_joint(scene.problem.model, goal.joint)
     return [Row(scene.q[q] - t[0], {v: 1.0})]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,20 +24,28 @@ from .race import Raced, Racer, racer
 from .step import Chain, fits
 
 Array = NDArray[np.float64]
+_MOST = 1000  # iterations a start, of which few take fifty
 
 
-def racer_of(problem: Problem, start: Array) -> Callable[..., tuple[Array, int]] | None:
+class Found(NamedTuple):
+    """First solution of a compiled search, (1, nq) or (0, nq), how many starts and iterations it took."""
+
+    q: Array
+    starts: int
+    iterations: int
+
+
+def racer_of(problem: Problem, start: Array) -> Callable[[Array], Found] | None:
     """Compiled search for a problem of one Position, Orientation or Pose of a chain; None for others.
 
-    Takes starts (k, nq) and the most iterations from each; gives the first solution found, (1, nq) to polish
-    or (0, nq), and the iterations spent.
+    Takes starts (k, nq), of which it makes as many as it needs.
     """
     if len(problem.goals) != 1 or problem.loops:
         return None
     goal = problem.goals[0]
     if not isinstance(goal, (Position, Orientation, Pose)) or goal.relative_to is not None:
         return None
-    tolerance = goal.tolerances()
+    tolerance = goal.tolerances(problem.model)
     if (tolerance > BAND).any():
         return None
     frame = moving_part(problem.kinematics.frame(goal.at), problem.moved, start)
@@ -48,16 +57,12 @@ def racer_of(problem: Problem, start: Array) -> Callable[..., tuple[Array, int]]
     p = np.zeros(3) if isinstance(goal, Orientation) else _position(goal)
     columns = [j.q for j in frame.joints]
 
-    def run(starts: Array, most: int) -> tuple[Array, int]:
-        spent = 0
-        for q in starts:
-            raced = compiled(q[columns], R, p, tolerance=(1e-6, 1e-6), most=most)
-            spent += int(raced.iterations[0])
-            if raced.met[0]:
-                full = start.copy()
-                full[columns] = raced.q[0]
-                return full[None], spent
-        return np.zeros((0, problem.space.nq)), spent
+    def run(starts: Array) -> Found:
+        table = starts[:, columns]
+        raced = compiled(table[0], R, p, tolerance=(1e-6, 1e-6), most=_MOST * len(starts), starts=table[1:])
+        q = np.tile(start, (int(raced.met[0]), 1))
+        q[:, columns] = raced.q[: len(q)]
+        return Found(q, 1 + int(raced.starts[0]), int(raced.iterations[0]))
 
     return run
 

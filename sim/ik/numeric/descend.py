@@ -119,47 +119,6 @@ def _steps(problem: Problem, q: Array, w: Rows, damping: Array) -> Array:
     return np.asarray(d * np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None])
 
 
-def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
-    """Newton's method for the nearest pose of one configuration q (nq,) that cannot meet its goals.
-
-    Gauss-Newton crawls where a residual stays (a stretched arm); the curvature of the kinematics, from
-    central differences of the gradient, gives the quadratic end. Levenberg's shift keeps it a descent.
-    """
-    space = problem.space
-    columns = np.flatnonzero(problem.moved)
-    x = space.clip(q[None])
-    w = problem.weighted(problem.raw(x))
-    cost, shift, done = float(_square(w.r)[0]), 1e-6, 0
-    for done in range(1, iterations + 1):  # noqa: B007
-        g = w.r[0] @ w.J[0]
-        _, mask = held_projection(problem, x, g[None], w.J)
-        free = columns[mask[0][columns]]
-        if not len(free) or np.abs(g[free]).max() < 1e-14:
-            break
-        H = _hessian(problem, x[0], free)
-        least = float(np.linalg.eigvalsh(H)[0])
-        improved = False
-        for _ in range(12):
-            A = H + (max(0.0, -least) * 1.1 + shift) * np.eye(len(free))
-            d = np.zeros(space.nv)
-            d[free] = -np.linalg.solve(A, g[free])
-            d *= min(1.0, 0.5 / max(np.abs(d).max(), 1e-300))
-            trial = space.step(x, d[None])
-            w_trial = problem.weighted(problem.raw(trial))
-            if (lower := float(_square(w_trial.r)[0])) < cost:
-                improved = True
-                break
-            shift *= 10
-        if not improved:
-            break
-        gain = cost - lower
-        x, w, cost, shift = trial, w_trial, lower, max(shift * 0.1, 1e-14)
-        if gain < 1e-15 * cost:
-            break
-    raw = problem.raw(x)
-    return Descent(x, raw.r, np.array([cost]), done, problem.met(raw.r))
-
-
 def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
     """q (nq,) after undamped Gauss-Newton steps of least norm, while these bring judged rows nearer."""
     x, columns = q[None], np.flatnonzero(problem.moved)
@@ -176,22 +135,3 @@ def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:
             break
         x, w = trial, w_trial
     return np.asarray(x[0])
-
-
-def _hessian(problem: Problem, q: Array, free: NDArray[np.intp]) -> Array:
-    """Second derivative (k, k) of half the cost along the freedoms `free`."""
-    h, k = 1e-5, len(free)
-    d = np.zeros((2 * k, problem.space.nv))
-    d[np.arange(k), free], d[np.arange(k, 2 * k), free] = h, -h
-    moved = _unclipped(problem, q, d)
-    w = problem.weighted(problem.raw(moved))
-    g = (w.r[:, None, :] @ w.J)[:, 0][:, free]
-    H = (g[:k] - g[k:]) / (2 * h)
-    return np.asarray(0.5 * (H + H.T))
-
-
-def _unclipped(problem: Problem, q: Array, d: Array) -> Array:
-    """Steps that may leave the limits a little: a derivative wants both sides."""
-    from ..space import Space
-
-    return Space(problem.model, limits=False).step(np.tile(q, (len(d), 1)), d)

@@ -13,15 +13,17 @@ from ..problem import Problem
 from .descend import Descent, descend
 
 Array = NDArray[np.float64]
+AT_LIMIT = 1e-6  # [rad or m] beyond a limit: clipped, it may still be right
 _BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found
-_MOST = 10_000  # iterations of a compiled search, each in all lanes: some thousand starts
 
 
 class Search:
     """One search over starts: what it found, what came nearest, and what it cost.
 
+    Starts follow from `seed` alone: several numbers name a search of a part of the question.
+
     Attributes:
-        used, iterations: random starts and iterations so far.
+        used, iterations: random starts and iterations so far; never more starts than `restarts`.
         ends: costs of all attempts that failed.
         hopeless: asked once after the first starts; if it says so, few more are tried, for the nearest pose.
     """
@@ -32,14 +34,19 @@ class Search:
         start: Array,
         *,
         restarts: int,
-        seed: int,
+        seed: tuple[int, ...],
         hopeless: Callable[[], bool] | None = None,
     ):
         self.problem, self.start, self.restarts, self.hopeless = problem, start, restarts, hopeless
         self.used = self.iterations = 0
         self.ends: list[float] = []
-        self._seed = seed
+        self._seed, self._asked = seed, restarts
         self._all: list[Descent] = []
+
+    def part(self, problem: Problem, restarts: int, number: int) -> Search:
+        """A search of a part of the question, by `number`, with no more restarts than this one was given."""
+        restarts = min(restarts, self._asked)
+        return Search(problem, self.start, restarts=restarts, seed=(*self._seed, number))
 
     def solutions(self, first: Array) -> Array:
         """Configurations (k, nq) that meet the problem: from `first` (k, nq), the start, then random starts.
@@ -48,7 +55,7 @@ class Search:
         """
         space, moved = self.problem.space, self.problem.moved
         found = [np.zeros((0, space.nq))]
-        inside = first[space.excess(first).max(axis=1, initial=0.0) <= 1e-9]
+        inside = first[space.excess(first).max(axis=1, initial=0.0) <= AT_LIMIT]
         if len(inside):
             found.append(self._attempt(inside, iterations=12))
         if not len(found[-1]):
@@ -68,7 +75,8 @@ class Search:
         return np.concatenate(found)
 
     def more(self, n: int) -> Array:
-        """Further solutions (k, nq), from the start, mid-range and n random starts."""
+        """Further solutions (k, nq), from the start, mid-range and n random starts, or what is left."""
+        n = max(0, min(n, self.restarts - self.used))
         middle = self.problem.space.middle(self.start, self.problem.moved)
         return self._attempt(np.concatenate([self.start[None], middle[None], self._random(n)]))
 
@@ -77,14 +85,17 @@ class Search:
         return self.problem.space.random(self.rng, n, self.start, self.problem.moved)
 
     def _raced(self) -> Array:
-        """A solution by compiled searches, where the goal is a pose of one chain."""
+        """A solution by a compiled search, where the goal is a pose of one chain."""
         racer = racer_of(self.problem, self.start)
         if racer is None:
             return np.zeros((0, self.problem.space.nq))
+        n = max(0, self.restarts - sum(_BLOCKS[:2]))  # the rest go all the way, for the nearest pose
         middle = self.problem.space.middle(self.start, self.problem.moved)
-        q, spent = racer(np.stack([self.start, middle]), most=_MOST)
-        self.iterations += spent
-        return self._attempt(q, iterations=12) if len(q) else q
+        starts = self.problem.space.random(self.rng, n, self.start, self.problem.moved)
+        found = racer(np.concatenate([self.start[None], middle[None], starts]))
+        self.used += max(0, found.starts - 2)
+        self.iterations += found.iterations
+        return self._attempt(found.q, iterations=12) if len(found.q) else found.q
 
     def _attempt(self, q: Array, *, first: bool = False, iterations: int = 100) -> Array:
         end = descend(self.problem, q, first=first, iterations=iterations)

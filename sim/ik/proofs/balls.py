@@ -66,7 +66,7 @@ def mass_gap(problem: Problem, goal: CenterOfMass, q: Array) -> float:
     ball = ball_of(problem, [(mass / whole, f) for mass, f in masses], q)
     if ball is None:
         return 0.0
-    kept, target = np.isfinite(goal.tolerances()), np.asarray(goal.target)
+    kept, target = np.isfinite(goal.tolerances(problem.model)), np.asarray(goal.target)
     if kept.all():
         return ball.gap(target)
     return max(0.0, float(np.linalg.norm((target - ball.center)[kept])) - ball.high)

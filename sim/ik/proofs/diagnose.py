@@ -2,48 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..chains.closed_form import closed_form
 from ..goals import Goal, Orientation, Pose, Position, Rows
-from ..numeric.descend import Descent, descend, sharpen
+from ..numeric.descend import Descent, descend
+from ..numeric.nearest import sharpen
 from ..numeric.search import Search
 from ..numeric.settle import settle
 from ..problem import Problem, freedom_names, unwound
 from ..verdict import Verdict
 from ..wholes import CenterOfMass
-from .gaps import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, subdivision
+from .gaps import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, rooms, subdivision
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """A negative verdict with a solution outside the limits, if that is the reason, and the nearest pose.
+class Diagnosis(NamedTuple):
+    """A negative verdict, with a solution outside the limits (nq,) if these are the reason.
 
-    `found`: a solution that the searches for reasons came upon after all.
+    `found` (k, nq): what the searches for reasons came upon after all.
     """
 
     verdict: Verdict
-    q_free: Array | None = None
-    nearest: Array | None = None
-    found: Array | None = None
+    q_free: Array | None
+    found: Array
 
 
 def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
     """Verdict on a problem that no start solved; `nearest` is the best pose found."""
     goals = problem.goals
+    if nearest.met[0]:  # a slow end, as at a singular boundary, got there after all
+        return _after_all(nearest)
     unlimited = problem.without_limits()
     gaps = {goal: goal_gap(unlimited, goal, search.start) for goal in goals}
-    blocked = [g for g in goals if _exceeds(gaps[g], g)]
+    blocked = [g for g in goals if _exceeds(problem, gaps[g], g)]
     if blocked:
         return _out_of_reach(problem, search, nearest, blocked[0], gaps[blocked[0]])
     for a, b in pairs(goals):
         gap = pair_gap(unlimited, a, b, search.start)
-        if _exceeds(gap, a, b):
+        if _exceeds(problem, gap, a, b):
             return _conflict(problem, search, nearest, (a, b), gap)
     free = _without_limits(problem, search, nearest)
     if free is not None:
@@ -56,17 +57,23 @@ def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
 def excluded(problem: Problem, q: Array) -> bool:
     """Whether lengths and limits prove, without any search, that the goals cannot be met."""
     goals = problem.goals
-    return any(_exceeds(goal_gap(problem, g, q), g) for g in goals) or any(
-        _exceeds(pair_gap(problem, a, b, q), a, b) for a, b in pairs(goals)
+    return any(_exceeds(problem, goal_gap(problem, g, q), g) for g in goals) or any(
+        _exceeds(problem, pair_gap(problem, a, b, q), a, b) for a, b in pairs(goals)
     )
 
 
-def _exceeds(gap: Gap, *goals: Goal) -> bool:
+def _exceeds(problem: Problem, gap: Gap, *goals: Goal) -> bool:
     """Whether a proved gap is larger than the goals' tolerances allow."""
-    room = sum(float(np.linalg.norm(t[np.isfinite(t)])) for t in (g.tolerances() for g in goals))
-    seen = (CenterOfMass,)  # gaps of these leave free rows out
-    free = any(not np.isfinite(g.tolerances()).all() and not isinstance(g, seen) for g in goals)
-    return not free and (gap.position > room or gap.rotation > room)
+    position = rotation = 0.0
+    for goal in goals:
+        if not isinstance(goal, CenterOfMass):  # gaps of these leave free rows out
+            free = ~np.isfinite(goal.tolerances(problem.model))
+            metres = np.array([u == "m" for u in goal.units(problem.model)], dtype=bool)
+            position += np.inf if (free & metres).any() else 0.0
+            rotation += np.inf if (free & ~metres).any() else 0.0
+        near, straight = rooms(problem, goal)
+        position, rotation = position + near, rotation + straight
+    return gap.position > position or gap.rotation > rotation
 
 
 def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array | None:
@@ -74,7 +81,7 @@ def _without_limits(problem: Problem, search: Search, nearest: Descent) -> Array
     free = problem.without_limits()
     form = closed_form(free, search.start)
     first = [search.best.q, nearest.q] + ([] if form is None else [form.q])
-    looking = Search(free, search.start, restarts=max(24, search.restarts // 2), seed=1)
+    looking = search.part(free, max(24, search.restarts // 2), 1)
     found = looking.solutions(np.concatenate(first))
     search.iterations += looking.iterations
     if not len(found):
@@ -98,8 +105,7 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
     """Limits are the reason, unless the solution found without them is inside after all."""
     inside = descend(problem, problem.space.clip(free[None]))
     if inside.met[0]:
-        verdict = Verdict("solved", True, "")
-        return Diagnosis(verdict, found=inside.q[0])
+        return _after_all(inside)
     excess = problem.space.excess(free[None])[0]
     joints = dict.fromkeys(freedom_names(problem.model, excess > 1e-09), 0.0)
     for v in np.flatnonzero(excess > 1e-9):
@@ -111,7 +117,7 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
     reason = f"without limits they are met, with {names} outside; inside, {_words(position, rotation)} remain"
     goals = tuple(g.label for g in problem.goals)
     verdict = Verdict("held by limits", proved, reason, position, rotation, 0.0, joints, goals)
-    return Diagnosis(verdict, q_free=free, nearest=nearest.q[0])
+    return _negative(problem, verdict, free)
 
 
 def _proved_held(problem: Problem, search: Search) -> bool:
@@ -128,7 +134,7 @@ def _sizes(problem: Problem, r: Array) -> tuple[float, float]:
     position = rotation = 0.0
     for group in problem.groups:
         if group.goal is not None:
-            p, w = group.goal.errors(r[:, group.rows])
+            p, w = group.goal.errors(r[:, group.rows], problem.model)
             position, rotation = float(np.hypot(position, p[0])), float(np.hypot(rotation, w[0]))
     return position, rotation
 
@@ -141,7 +147,7 @@ def _words(position: float, rotation: float) -> str:
 def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal, gap: Gap) -> Diagnosis:
     """One goal that cannot be met even without limits."""
     alone = problem.only([goal])
-    position, rotation, q = _apart(alone, search, nearest if len(problem.goals) == 1 else None)
+    position, rotation = _apart(alone, search, nearest if len(problem.goals) == 1 else None)
     proved = gap != NO_GAP
     by = gap.by
     if not proved:
@@ -161,35 +167,42 @@ def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal
         reason += f", by {by}"
     kind = "out of reach" if sure else "not found"
     verdict = Verdict(kind, proved, reason, position, rotation, gap.position, None, (goal.label,))  # type: ignore[arg-type]
-    return Diagnosis(verdict, nearest=q if len(problem.goals) == 1 else nearest.q[0])
+    return _negative(problem, verdict)
 
 
-def _apart(problem: Problem, search: Search, nearest: Descent | None) -> tuple[float, float, Array]:
-    """How far position and rotation of one goal stay away (see `Verdict`), and the nearest pose (nq,)."""
+def _after_all(end: Descent) -> Diagnosis:
+    return Diagnosis(Verdict("solved", True, ""), None, end.q[:1])
+
+
+def _negative(problem: Problem, verdict: Verdict, free: Array | None = None) -> Diagnosis:
+    return Diagnosis(verdict, free, np.zeros((0, problem.space.nq)))
+
+
+def _apart(problem: Problem, search: Search, nearest: Descent | None) -> tuple[float, float]:
+    """How far position and rotation of one goal stay away (see `Verdict`)."""
     goal = problem.goals[0]
+    end = nearest or _closest(problem, search)
     if not isinstance(goal, Pose):
-        end = nearest or _closest(problem, search)
-        return (*_sizes(problem, end.r), end.q[0])
-    t = goal.tolerances()
+        return _sizes(problem, end.r)
+    t = goal.tolerances(problem.model)
     place = problem.only([Position(goal.at, goal.position, goal.relative_to, tolerance=tuple(t[:3]))])
     turn = problem.only([Orientation(goal.at, goal.quat, goal.relative_to, tolerance=tuple(t[3:]))])
     placed, turned = _closest(place, search), _closest(turn, search)
-    end = nearest or _closest(problem, search)
     if not placed.met[0] or not turned.met[0]:
         first = place if not placed.met[0] else turn
         here = placed if not placed.met[0] else turned
         position, rotation = _sizes(first, here.r)
         if not placed.met[0] and not turned.met[0]:
             rotation = _sizes(turn, turned.r)[1]
-        return position, rotation, end.q[0]
+        return position, rotation
     position = _least(turn, place, search, end)
     rotation = _least(place, turn, search, end)
-    return position, rotation, end.q[0]
+    return position, rotation
 
 
 def _closest(problem: Problem, search: Search) -> Descent:
     """Nearest pose of a part of the question."""
-    part = Search(problem, search.start, restarts=min(search.restarts, 60), seed=2)
+    part = search.part(problem, 60, 2)
     found = part.solutions(search.best.q[:6])
     search.iterations += part.iterations
     if len(found):
@@ -202,8 +215,7 @@ def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> floa
     """Least residual of `wanted` while `held` is met, from several starts: a number in its own unit."""
     starts = np.concatenate([end.q, search.best.q[:6]])
     feasible = descend(held, starts)
-    part = Search(held, search.start, restarts=24, seed=3)
-    more = [feasible.q[feasible.met], part.more(24)]
+    more = [feasible.q[feasible.met], search.part(held, 24, 3).more(24)]
     q = np.concatenate(more)
     if not len(q):
         return 0.0
@@ -233,7 +245,7 @@ def _conflict(
         proved = subdivision(part.without_limits(), search.start)
         reason += ", by subdivision of the joints' ranges" if proved else ""
     verdict = Verdict("conflict", proved, reason, position, rotation, gap.position, None, names)
-    return Diagnosis(verdict, nearest=nearest.q[0])
+    return _negative(problem, verdict)
 
 
 def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
@@ -242,7 +254,7 @@ def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
         alone = problem.only([goal])
         if not _meets(alone, search):
             free = _without_limits(alone, search, nearest)
-            part = Search(alone, search.start, restarts=search.restarts, seed=4)
+            part = search.part(alone, search.restarts, 4)
             found = part.solutions(search.best.q[:6])
             if len(found):
                 continue
@@ -253,8 +265,8 @@ def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
                 else _held(alone, part, end, free)
             )
             search.iterations += part.iterations
-            if inner.found is None:
-                return Diagnosis(inner.verdict, inner.q_free, nearest.q[0])
+            if not len(inner.found):
+                return inner
     core = list(problem.goals)
     for goal in problem.goals:  # deletion filter: what is left cannot spare any goal
         rest = [g for g in core if g is not goal]
@@ -264,7 +276,7 @@ def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
 
 
 def _meets(problem: Problem, search: Search) -> bool:
-    part = Search(problem, search.start, restarts=min(search.restarts, 100), seed=5)
+    part = search.part(problem, min(search.restarts, 100), 5)
     met = len(part.solutions(search.best.q[:6])) > 0
     search.iterations += part.iterations
     return met

@@ -37,7 +37,7 @@ NO_GAP = Gap(0.0, 0.0, "")
 def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
     """Least violation of one goal that the lengths of its chain and the problem's limits prove."""
     position = rotation = 0.0
-    by = ""
+    by, model = "", problem.model
     if isinstance(goal, (Position, Pose)):
         target = goal.target if isinstance(goal, Position) else goal.position
         position = _between(problem, _base(problem, goal.relative_to, np.asarray(target)), goal.at, q)
@@ -58,9 +58,10 @@ def goal_gap(problem: Problem, goal: Goal, q: Array) -> Gap:
     if isinstance(goal, LookAt):
         rotation, by = sight_gap(problem, goal, q), "the axes of the chain"
     if isinstance(goal, JointValue):
-        _, v = scalar_joint(problem.kinematics, goal.joint)
-        low, high = problem.space.low[v], problem.space.high[v]
-        rotation, by = max(0.0, low - goal.value, goal.value - high), "the joint's range"
+        _, v = scalar_joint(model, goal.joint)
+        beyond = max(0.0, problem.space.low[v] - goal.value, goal.value - problem.space.high[v])
+        position, rotation = (beyond, 0.0) if goal.units(model) == ("m",) else (0.0, beyond)
+        by = "the joint's range"
     return Gap(position, rotation, by) if position > 0 or rotation > 0 else NO_GAP
 
 
@@ -143,7 +144,8 @@ def pair_gap(problem: Problem, a: Goal, b: Goal, q: Array) -> Gap:
     if isinstance(a, (Orientation, Pose)) and isinstance(b, (Orientation, Pose)) and _same_base(a, b):
         return _turn_conflict(problem, a, b, q)
     if isinstance(a, JointValue) and isinstance(b, JointValue) and a.joint == b.joint and a.value != b.value:
-        return Gap(0.0, abs(a.value - b.value), "one joint")
+        apart, slides = abs(a.value - b.value), a.units(problem.model) == ("m",)
+        return Gap(apart * slides, apart * (not slides), "one joint")
     return NO_GAP
 
 
@@ -162,6 +164,14 @@ def _turn_conflict(problem: Problem, a: Orientation | Pose, b: Orientation | Pos
     wanted = rotations.to_matrix(a.quat).T @ rotations.to_matrix(b.quat)
     angle = float(np.linalg.norm(rotations.log(rotations.from_matrix(wanted.T @ R))))
     return Gap(0.0, angle, "one link") if angle > 1e-9 else NO_GAP
+
+
+def rooms(problem: Problem, goal: Goal) -> tuple[float, float]:
+    """Size of residuals, in metres and in radians, that a goal's tolerances allow, free rows left out."""
+    t, units = goal.tolerances(problem.model), goal.units(problem.model)
+    kept = np.where(np.isfinite(t), t, 0.0)
+    position, rotation = (float(np.linalg.norm(kept[[u == unit for u in units]])) for unit in ("m", "rad"))
+    return position, rotation * (0.5 * np.pi if isinstance(goal, LookAt) else 1.0)  # angles by their chords
 
 
 def pairs(goals: tuple[Goal, ...]) -> list[tuple[Goal, Goal]]:
@@ -202,8 +212,8 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
     low, high = _whole_turns(problem, columns, low, high)
     for goal in problem.goals:
         if isinstance(goal, JointValue):
-            at = columns == scalar_joint(problem.kinematics, goal.joint)[1]
-            near = float(goal.tolerances()[0])
+            at = columns == scalar_joint(problem.model, goal.joint)[1]
+            near = float(goal.tolerances(problem.model)[0])
             bottom, top = (problem.space.low[columns][at], problem.space.high[columns][at])
             low[at], high[at] = np.maximum(bottom, goal.value - near), np.minimum(top, goal.value + near)
     if (low > high).any():
@@ -224,11 +234,9 @@ def subdivision(problem: Problem, q0: Array, *, boxes: int = _BOXES) -> bool:
         r = problem.raw(q).r
         alive = np.ones(len(centre), dtype=bool)
         for goal, group, rate in zip(problem.goals, problem.groups, rates, strict=True):
-            position, rotation = goal.errors(r[:, group.rows])
-            room = half @ rate
-            slack = np.linalg.norm(np.where(np.isfinite(goal.tolerances()), goal.tolerances(), 0.0))
-            slack *= 0.5 * np.pi if isinstance(goal, LookAt) else 1.0  # angles of sights by their chords
-            alive &= (position <= room[:, 0] + slack) & (rotation <= room[:, 1] + slack)
+            position, rotation = goal.errors(r[:, group.rows], problem.model)
+            travel, near, straight = half @ rate, *rooms(problem, goal)
+            alive &= (position <= travel[:, 0] + near) & (rotation <= travel[:, 1] + straight)
         centre, half = centre[alive], half[alive]
         if not len(centre):
             return True
@@ -251,7 +259,8 @@ def _rates(problem: Problem, goal: Goal, columns: NDArray[np.intp], q0: Array) -
     """Bounds (k, 2) on how fast the goal's metres and radians change with each joint, or None."""
     if isinstance(goal, JointValue):
         out = np.zeros((len(columns), 2))
-        out[columns == scalar_joint(problem.kinematics, goal.joint)[1], 1] = 1.0
+        unit = 0 if goal.units(problem.model) == ("m",) else 1
+        out[columns == scalar_joint(problem.model, goal.joint)[1], unit] = 1.0
         return out
     if isinstance(goal, CenterOfMass):
         masses = problem.kinematics.masses()
