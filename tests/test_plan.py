@@ -10,7 +10,7 @@ from pantograph.sim import Scene, SceneError, make_plan, run
 from pantograph.sim.engines.interface import Drive, Role
 from pantograph.sim.engines.smooth import width_of
 from pantograph.sim.engines.touch import can_touch
-from pantograph.sim.plan import fastest_rate
+from pantograph.sim.needs import Needs
 
 PENDULUM = {"models": [{"file": "pendulum"}]}
 KEYED = {"keys": [{"joint": "hinge", "times": [0, 1], "values": [0, 1]}]}
@@ -141,16 +141,81 @@ def spring_scene(tmp_path, joint, actuator="", **data):
 
 def test_the_fastest_rate_is_that_of_the_stiffest_spring_damper_or_servo(tmp_path):
     def rate(*args, **data):
-        return fastest_rate(make_plan(spring_scene(tmp_path, *args, **data)).setup)
+        return Needs(make_plan(spring_scene(tmp_path, *args, **data)).setup).fastest
 
     assert rate("") == 0
     assert rate('stiffness="400"') == pytest.approx(10)
     assert rate('damping="8"') == pytest.approx(2)
+    assert rate('springdamper="0.1 1"') == pytest.approx(10, rel=1e-2)
     servo = '<position joint="x" kp="100" gear="3"/>'
     assert rate("", servo) == 0  # nothing drives it
     assert rate("", servo, roles={"tracked": ["x"]}) == pytest.approx(15)
     keyed = [{"joint": "x", "times": [0], "values": [0]}]
     assert rate('stiffness="400"', keys=keyed) == 0
+
+
+STIFF = ("joint", "cubic", "damper", "tendon", "tendon damper", "servo", "tendon servo")
+
+
+@st.composite
+def stiff_models(draw):
+    """Random trees out of their rest, one spring, damper or servo of any strength in them: the model, its
+    state, and the energy that its springs and servos hold."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    stiff, strength = draw(st.sampled_from(STIFF)), 10.0 ** draw(st.floats(2.0, 7.0))
+    spec, n = mujoco.MjSpec(), draw(st.integers(2, 4))
+    spec.option.timestep, spec.option.gravity = 0.002, [0.0, 0.0, 0.0]
+    bodies, tendon = [spec.worldbody], spec.add_tendon(name="t")
+    q, arms = 0.1 * rng.normal(size=n), rng.normal(size=n)
+    for i in range(n):
+        body = bodies[draw(st.integers(0, i))].add_body(name=f"b{i}", pos=rng.normal(size=3) * 0.3)
+        kind = mujoco.mjtJoint.mjJNT_SLIDE if draw(st.booleans()) else mujoco.mjtJoint.mjJNT_HINGE
+        joint = body.add_joint(name=f"j{i}", type=kind, axis=rng.normal(size=3), stiffness=[1.0, 0.0, 0.0])
+        tendon.wrap_joint(f"j{i}", arms[i])
+        size = 0.05 + 0.1 * rng.random(3)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, contype=0, conaffinity=0)
+        bodies.append(body)
+    energy, length = 0.5 * q @ q, arms @ q
+    if stiff == "joint":
+        joint.stiffness[0] = strength
+        energy += 0.5 * strength * q[-1] ** 2
+    elif stiff == "cubic":
+        joint.stiffness[2] = 100 * strength
+        energy += 25 * strength * q[-1] ** 4
+    elif stiff == "tendon":
+        tendon.stiffness[0], tendon.springlength = strength, [0.0, 0.0]
+        energy += 0.5 * strength * length**2
+    elif "damper" in stiff:
+        (tendon if "tendon" in stiff else joint).damping[0] = strength / 100
+    else:
+        servo = spec.add_actuator(name="servo", target="t", trntype=mujoco.mjtTrn.mjTRN_TENDON)
+        if stiff == "servo":
+            servo.target, servo.trntype = joint.name, mujoco.mjtTrn.mjTRN_JOINT
+        servo.set_to_position(kp=strength, kv=0.01)
+        servo.gear[0] = 3.0
+        energy += 4.5 * strength * (length if "tendon" in stiff else q[-1]) ** 2
+    return spec, q, energy
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("models")
+
+
+@given(case=stiff_models())
+@settings(max_examples=60)
+def test_the_method_that_is_chosen_is_stable_at_its_step(folder, case):
+    """Nothing can move faster than what its springs hold lets it: sum of v M v / 2 <= energy."""
+    spec, q, energy = case
+    spec.compile()
+    file = folder / "model.xml"
+    file.write_text(spec.to_xml())
+    keys = [{"actuator": a.name, "times": [0], "values": [0]} for a in spec.actuators]
+    start = {"position": {f"j{i}": x for i, x in enumerate(q)}}
+    scene = Scene(duration=0.4, models=[{"file": str(file)}], keys=keys, initial=start)
+    recording = run(scene)
+    assert recording.status == "done", recording.message
+    assert recording.kinetic.max() <= 1.1 * energy, make_plan(scene).integrator
 
 
 def test_stiff_scenes_get_the_integrator_for_them(tmp_path):

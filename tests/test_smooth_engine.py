@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -13,11 +14,13 @@ from oracles.sine import sine
 from pantograph.sim import Scene, make_plan, run
 from pantograph.sim.clip import Clip
 from pantograph.sim.curves import keyed
+from pantograph.sim.dynamics import compile_model
+from pantograph.sim.engines.common import Broken
 from pantograph.sim.engines.contact import ContactEngine
 from pantograph.sim.engines.interface import Problem, Role, State
-from pantograph.sim.engines.limits import complementary
-from pantograph.sim.engines.smooth import SmoothEngine
-from pantograph.sim.errors import SceneError
+from pantograph.sim.engines.limits import complementary, rebound
+from pantograph.sim.engines.smooth import SmoothEngine, differences
+from pantograph.sim.errors import EngineError, SceneError
 from scipy.integrate import solve_ivp
 
 G = 9.81
@@ -643,3 +646,202 @@ def test_a_plan_by_tolerance_promises_no_step():
         SceneError, match="steps at a fixed rate, and not the smooth one, since bodies can touch"
     ):
         make_plan(Scene(duration=0.5, models=[{"file": "quadruped"}], solver={"tolerance": 1e-8}))
+
+
+def bounces(tmp_path, restitution, solver, *, height=0.5, duration=2.5, xml=SLIDE):
+    physics = {"restitution": restitution}
+    start = {"position": {"z": height - 0.5}}
+    return run(
+        scene_of(tmp_path, xml, duration=duration, physics=physics, solver=solver, initial=start, rate=500)
+    )
+
+
+@pytest.mark.parametrize(
+    "solver", [{}, {"step": 0.02}, {"tolerance": 1e-9}, {"tolerance": 1e-6, "integrator": "bosh3"}]
+)
+@pytest.mark.parametrize(("restitution", "height"), [(0.5, 0.5), (0.8, 0.2), (1.0, 0.3), (0.1, 1.0)])
+def test_a_joint_rebounds_with_the_stated_part_of_its_speed(tmp_path, restitution, height, solver):
+    """Times and heights of every bounce in closed form; the last are slower than 1 mm/s and end at rest."""
+    r = bounces(tmp_path, restitution, solver, height=height)
+    assert r.status == "done"
+    times = np.array([e.t for e in r.events if e.kind == "limit"])
+    first = np.sqrt(2 * height / G)
+    flights = 2 * first * restitution ** np.arange(1, 1000)
+    exact = np.concatenate([[first], first + np.cumsum(flights)])
+    speeds = restitution ** np.arange(1, 1001) * G * first
+    still = int(np.argmax(speeds <= 1e-3)) if restitution < 1 else len(speeds)
+    exact = exact[: still + 1][exact[: still + 1] <= 2.5]
+    assert len(times) == len(exact)
+    np.testing.assert_allclose(times, exact, atol=1e-9)
+    assert len([e for e in r.events if e.kind == "limit end"]) == len(exact) - (restitution < 1)
+    for k, (begin, end) in enumerate(itertools.pairwise(exact[:4])):
+        inside = (r.t > begin) & (r.t < end)
+        s, v = r.t[inside] - begin, restitution ** (k + 1) * G * first
+        np.testing.assert_allclose(r.q[inside, 0], -0.5 + v * s - G * s**2 / 2, atol=1e-8)
+        mechanical = r.energy[inside] - 2 * G * -0.5
+        np.testing.assert_allclose(mechanical, 2 * G * height * restitution ** (2 * k + 2), rtol=1e-6)
+    if restitution < 1:
+        rest = r.t > times[-1]
+        assert rest.any() and np.all(r.q[rest, 0] == -0.5) and np.all(r.v[rest] == 0.0)
+    assert r.stats["restitution"] == restitution
+
+
+@pytest.mark.parametrize("solver", [{}, {"tolerance": 1e-8}])
+def test_bounces_that_are_far_shorter_than_a_step_end_at_rest(tmp_path, solver):
+    """A motor of 4 kN presses the joint on its limit: a flight at 1 mm/s takes a microsecond."""
+    xml = SLIDE.replace('name="push" joint="z"', 'name="push" joint="z" gear="-4000"')
+    keys = [{"actuator": "push", "times": [0.0], "values": [1.0]}]
+    file = tmp_path / "pressed.xml"
+    file.write_text(xml)
+    scene = Scene(
+        models=[{"file": str(file)}], duration=0.2, keys=keys, solver=solver, physics={"restitution": 0.7}
+    )
+    r = run(scene)
+    a = 4000 / 2 + G
+    first = np.sqrt(2 * 0.5 / a)
+    count = int(np.ceil(np.log(1e-3 / (a * first)) / np.log(0.7)))
+    times = [e.t for e in r.events if e.kind == "limit"]
+    assert len(times) == count
+    exact = first * (1 + 2 * np.sum(0.7 ** np.arange(1, count)))
+    np.testing.assert_allclose(times[-1], exact, atol=1e-9)
+    assert r.q[-1, 0] == -0.5 and r.v[-1, 0] == 0.0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.floats(0.0, 1.0))
+def test_rebounds_never_make_energy_and_leave_nothing_on_its_way_into_a_limit(seed, n, restitution):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    W, u = A @ A.T + 0.1 * np.eye(n), rng.normal(size=n)
+    p = rebound(W, u, restitution)
+    after = u + W @ p
+    assert p.min() >= 0.0
+    assert after.min() >= -1e-9 * (1 + np.abs(u).max())
+    # what the impulses change in kinetic energy, u W^-1 u / 2 in these coordinates
+    assert p @ (u + after) / 2 <= 1e-9 * (1 + p @ p)
+    if n == 1 and u[0] < 0:
+        np.testing.assert_allclose(after, -restitution * u if restitution * -u > 1e-3 else 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-9])
+def test_rebounds_of_a_whirled_chain_keep_its_energy_when_they_are_elastic(tmp_path, tolerance):
+    n, limit = 4, 0.3
+    start = {f"j{i}": 10.0 * (1 if i % 2 else -1) for i in range(n)}
+    xml = chain_with_limits(n, limit).replace('damping=".01"', "")
+    solver = {"step": 1e-4} if tolerance is None else {"tolerance": tolerance}
+    scene = scene_of(
+        tmp_path, xml, duration=0.2, initial={"velocity": start}, physics={"restitution": 1.0}, solver=solver
+    )
+    r = run(scene)
+    assert r.status == "done"
+    assert len([e for e in r.events if e.kind == "limit"]) > 10
+    assert np.abs(r.q).max() <= limit + 1e-9
+    np.testing.assert_allclose(r.energy, r.energy[0], atol=1e-6 * abs(r.energy[0]) + 1e-6)
+
+
+LIMITED = """
+<mujoco><worldbody>
+  <body><joint name="a" type="{kind}" {joint}/><geom size=".1" pos=".1 0 0" contype="0" conaffinity="0"/>
+  </body>
+</worldbody><tendon>{tendon}</tendon></mujoco>"""
+TENDON = '<fixed name="t" limited="true" range="-1 1"><joint joint="a" coef="1"/></fixed>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "joint", "tendon", "named"),
+    [
+        ("ball", 'range="0 0.3" limited="true"', "", "joint 'a': a limit of a ball joint"),
+        ("hinge", "", TENDON, "tendon 't': a limit of a tendon"),
+    ],
+)
+def test_limits_that_no_run_can_locate_are_refused_by_name(tmp_path, kind, joint, tendon, named):
+    xml = LIMITED.format(kind=kind, joint=joint, tendon=tendon)
+    plan = make_plan(scene_of(tmp_path, xml, duration=0.1))
+    assert plan.engine.what == "contact" and named in plan.engine.why
+    with pytest.raises(EngineError, match=named):
+        SmoothEngine().run(plan.problem, (0.0, 0.1), None)
+    without = make_plan(scene_of(tmp_path, xml, duration=0.1, physics={"limits": False}))
+    assert without.engine.what == "smooth"
+    assert SmoothEngine().run(without.problem, (0.0, 0.1), None).status == "done"
+
+
+def test_restitution_is_asked_only_of_an_engine_that_has_it(tmp_path):
+    physics = {"restitution": 0.5}
+    said = make_plan(scene_of(tmp_path, SLIDE, duration=1.0, physics=physics)).left_out
+    assert any("rebounds with restitution 0.5" in line and "0.001" in line for line in said)
+    with pytest.raises(SceneError, match=r"physics\.restitution: rebounds belong to the smooth engine"):
+        make_plan(Scene(duration=1.0, models=[{"file": "quadruped"}], physics=physics))
+    with pytest.raises(SceneError, match=r"physics\.restitution: the contact engine.*soft"):
+        make_plan(scene_of(tmp_path, SLIDE, duration=1.0, physics=physics, solver={"engine": "contact"}))
+    with pytest.raises(SceneError, match=r"physics\.restitution.*at most 1"):
+        Scene(duration=1.0, models=[{"file": "arm6"}], physics={"restitution": 1.5})
+    problem = make_plan(scene_of(tmp_path, SLIDE, duration=1.0)).problem
+    with pytest.raises(EngineError, match=r"restitution must lie in \[0, 1\], not -0\.5"):
+        SmoothEngine().run(dataclasses.replace(problem, restitution=-0.5), (0.0, 1.0), None)
+
+
+def test_differences_count_the_limits_that_are_met(tmp_path):
+    """Three joints have limits: one is keyed, one is a ball, which leaves one to be met."""
+    part = '<body><joint name="{n}" type="{k}" {r}/><geom size=".1" contype="0" conaffinity="0"/></body>'
+    joints = [("a", "hinge", "0 1"), ("b", "hinge", "-1 1"), ("c", "ball", "0 1"), ("d", "slide", None)]
+    bodies = "".join(
+        part.format(n=n, k=k, r=f'range="{r}" limited="true" frictionloss=".1"' if r else "")
+        for n, k, r in joints
+    )
+    xml = f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
+    keys = [{"joint": "a", "times": [0, 1], "values": [0, 1]}]
+    plan = make_plan(scene_of(tmp_path, xml, duration=1.0, keys=keys))
+    lines = differences(plan.problem)
+    assert len(lines) == 2, lines
+    assert lines[0].startswith("limits of one joint are hard stops")
+    assert lines[1].startswith("dry friction on 4 freedoms")
+    bare = compile_model(plan.problem.model, keyed=["a"]).differences
+    assert bare[0].startswith("limits of one joint are left out")
+    assert bare[1] == "joint 'c': a limit of a ball joint, which is left out"
+    assert bare[2].startswith("dry friction on 4 freedoms is left out")
+    off = make_plan(
+        scene_of(tmp_path, xml, duration=1.0, keys=keys, physics={"limits": False, "friction": False})
+    )
+    assert differences(off.problem) == []
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-9])
+def test_a_run_that_a_controller_breaks_ends_with_its_last_step(tmp_path, tolerance):
+    plan = make_plan(scene_of(tmp_path, SLIDE, duration=1.0, solver={"step": 0.002}, rate=10))
+
+    class Failing(Constant):
+        def sample(self, k, t, q, v):
+            if k == 13:
+                raise ValueError("no more")
+            return self.held
+
+    problem = dataclasses.replace(
+        plan.problem, tolerance=tolerance, integrator="dopri5" if tolerance else "rk4"
+    )
+    with pytest.raises(Broken) as caught:
+        SmoothEngine().run(problem, (0.0, 1.0), Failing(np.zeros(1), 1))
+    segment = caught.value.segment
+    assert segment.t[-1] == pytest.approx(0.13)
+    np.testing.assert_allclose(segment.q[-1, 0], -G * 0.13**2 / 2, atol=1e-9)
+    assert "t = 0.13 s" in segment.message and len(segment.a) == len(segment.t)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-13, -1e-13])
+def test_a_limit_met_at_the_very_end_does_not_lose_the_run(tmp_path, shift):
+    end = np.sqrt(2 * 0.5 / G)
+    scene = scene_of(tmp_path, SLIDE, duration=end * (1 + shift), solver={"tolerance": 1e-9})
+    r = run(scene, error=True)
+    assert r.status == "done"
+    assert r.t[-1] == pytest.approx(end, abs=1e-12)
+    np.testing.assert_allclose(r.q[-1, 0], -0.5, atol=1e-9)
+    assert len(set(r.t)) == len(r.t)
+    assert [e.kind for e in r.events] in ([], ["limit"])
+    assert np.isfinite(r.error.length).all()
+
+
+def test_tolerances_below_what_rounding_allows(tmp_path):
+    """A run follows 1e-13, of which nothing can be said by one that is tighter; the recording says so."""
+    scene = scene_of(tmp_path, SLIDE, duration=0.2, solver={"tolerance": 1e-13, "integrator": "dop853"})
+    r = run(scene, error=True)
+    assert r.status == "done" and r.error is None
+    assert any("below a tolerance of 1e-12" in note for note in r.notes)
+    np.testing.assert_allclose(r.q[-1, 0], -G * 0.2**2 / 2, atol=1e-13)

@@ -71,7 +71,7 @@ class Machine:
         self.parameters, self.friction_width = parameters, friction_width
         self.lanes = lanes or jit.preferred_lanes()
         self.threads = threads or workers()
-        self.differences = tuple(differences(model, friction_width=friction_width))
+        self.differences = tuple(differences(model, friction_width=friction_width, keyed=layout.keyed))
         self.parameter_values = np.array(
             [
                 np.atleast_2d(getattr(model, f).T).T[r, c]

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from .forces import active, disabled
-from .rigid.tree import BALL, FREE
+from .rigid.tree import BALL, FREE, HINGE, SLIDE
 
 _OBJ = mujoco.mjtObj
 _DYN, _GAIN, _BIAS, _TRN, _WRAP = (
@@ -126,16 +126,62 @@ def _actuator(model: mujoco.MjModel, actuator: int) -> list[str]:
     return found
 
 
-def differences(model: mujoco.MjModel, *, friction_width: float | None) -> list[str]:
-    """Physics of `model` that the smooth engine models otherwise than MuJoCo, one line each."""
+def limited_joints(model: mujoco.MjModel, *, keyed: Collection[int] = ()) -> list[int]:
+    """Hinges and slides with limits that are part of the physics."""
+    if disabled(model, "LIMIT") or disabled(model, "CONSTRAINT"):
+        return []
+    limited = (model.jnt_limited != 0) & np.isin(model.jnt_type, (HINGE, SLIDE))
+    return [int(j) for j in np.flatnonzero(limited) if j not in keyed]
+
+
+def unlocated(model: mujoco.MjModel, *, keyed: Collection[int] = ()) -> list[str]:
+    """Limits that are part of the physics and that no run of the smooth engine can locate, one line each."""
+    if disabled(model, "LIMIT") or disabled(model, "CONSTRAINT"):
+        return []
+    balls = np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type == BALL))
+    kinds = (
+        (_OBJ.mjOBJ_JOINT, [j for j in balls if j not in keyed]),
+        (_OBJ.mjOBJ_TENDON, _taut(model, keyed)),
+    )
+    found = []
+    for kind, of in kinds:
+        what = "a limit of a ball joint" if kind == _OBJ.mjOBJ_JOINT else "a limit of a tendon"
+        found += [f"{_name(model, kind, int(i))}: {what}" for i in of]
+    return found
+
+
+def _taut(model: mujoco.MjModel, keyed: Collection[int]) -> list[int]:
+    """Tendons with limits, those aside whose joints are all keyed."""
+    out = []
+    for tendon in np.flatnonzero(model.tendon_limited).tolist():
+        path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        along_joints = (model.wrap_type[path] == int(_WRAP.mjWRAP_JOINT)).all()
+        if not (along_joints and all(int(j) in keyed for j in model.wrap_objid[path])):
+            out.append(tendon)
+    return out
+
+
+def differences(
+    model: mujoco.MjModel,
+    *,
+    friction_width: float | None,
+    keyed: Collection[int] = (),
+    at_limits: str | None = None,
+) -> list[str]:
+    """Physics of `model` that the smooth engine models otherwise than MuJoCo, one line each.
+
+    `keyed` are the joints (by id) whose motion is prescribed. `at_limits` says what joint limits are to who
+    locates them, as runs of a scene do; without, nothing looks at them.
+    """
     found: list[str] = []
-    if disabled(model, "CONSTRAINT"):
-        return found
-    limited = int(np.count_nonzero(model.jnt_limited)) + int(np.count_nonzero(model.tendon_limited))
-    if limited and not disabled(model, "LIMIT"):
-        found.append(f"{limited} joint or tendon limits are not forces here: crossing one is an event")
-    dry = int(np.count_nonzero(model.dof_frictionloss))
-    if dry and not disabled(model, "FRICTIONLOSS"):
+    if limited := limited_joints(model, keyed=keyed):
+        of = "one joint" if len(limited) == 1 else f"{len(limited)} joints"
+        found.append(f"limits of {of} are {at_limits or 'left out'}; MuJoCo's are soft constraints")
+    if at_limits is None:
+        found += [f"{line}, which is left out" for line in unlocated(model, keyed=keyed)]
+    dry = [d for d in np.flatnonzero(model.dof_frictionloss) if int(model.dof_jntid[d]) not in keyed]
+    if dry and not (disabled(model, "FRICTIONLOSS") or disabled(model, "CONSTRAINT")):
+        on = "one freedom" if len(dry) == 1 else f"{len(dry)} freedoms"
         how = "left out" if friction_width is None else f"smoothed below {friction_width:g} rad/s or m/s"
-        found.append(f"dry friction on {dry} freedoms is {how}; MuJoCo models it as a soft constraint")
+        found.append(f"dry friction on {on} is {how}; MuJoCo models it as a soft constraint")
     return found

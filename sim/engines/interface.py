@@ -88,6 +88,8 @@ class Problem:
     ``servo`` maps an actuator driven by keys to its ctrl over time: t (n,) -> (n,).
     ``sample_every`` steps lie between two recorded samples. ``tolerance`` asks for adaptive steps.
     ``live`` makes, for a controller's period [s], the targets of tracked joints that follow goals live.
+    ``friction_width`` [rad/s, m/s] smooths dry friction where an engine must; ``restitution`` is the part of
+    its speed that a joint keeps at a limit, where an engine locates limits.
     """
 
     model: mujoco.MjModel
@@ -104,6 +106,7 @@ class Problem:
     tolerance: float | None = None
     live: Callable[[float], Aims] | None = None
     friction_width: float | None = None
+    restitution: float = 0.0
 
     @property
     def steps(self) -> int:

@@ -5,12 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kinds import SCALAR
 from .interface import Array, Problem, Role
+
+_MOST = 10  # impacts at one moment that throw joints back; another stops them
+
+STILL = 1e-3
+"""Speed [rad/s, m/s] that no rebound is slower than: a joint that would leave its limit more slowly stays."""
+
+
+def in_words(restitution: float) -> str:
+    """What limits do to the joints that meet them."""
+    if not restitution:
+        return "hard stops (restitution 0)"
+    slow = f"stops where these would be slower than {STILL:g} rad/s or m/s"
+    return f"rebounds with restitution {restitution:g}, and {slow}"
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,25 @@ def complementary(W: Array, b: Array) -> Array:
         return np.zeros(0)
     L = np.linalg.cholesky(W)
     return np.asarray(nnls(L.T, -np.linalg.solve(L, b))[0])
+
+
+def rebound(W: Array, u: Array, restitution: float) -> Array:
+    """Velocities away from their limits after an impact of joints that come with velocities `u`.
+
+    Impulses p >= 0 give u+ = u + W p, W = J M^-1 J', with W p + (1 + e) u >= 0 and p (W p + (1 + e) u) = 0
+    (Newton's restitution e): the kinetic energy changes by (1 - e) p u / 2 <= 0. Where that throws one joint
+    at another's limit, another impact follows.
+    """
+    u, impulse = u.copy(), np.zeros(len(u))
+    for again in range(_MOST + 1):
+        closing = -float(u.min(initial=0.0))
+        if again and closing <= 1e-12 * (1.0 + np.abs(u).max()):
+            break
+        e = restitution if restitution * closing > STILL and again < _MOST else 0.0
+        p = complementary(W, (1.0 + e) * u)
+        impulse += p
+        u += W @ p
+    return impulse
 
 
 def slack(force: Array) -> Array:
@@ -93,12 +123,12 @@ class Limits:
 
 def limits_of(problem: Problem) -> Limits:
     """Limits that are part of the scene's physics, of joints that are not keyed."""
+    from ..dynamics.support import limited_joints
+
     m = problem.model
-    off = int(mujoco.mjtDisableBit.mjDSBL_LIMIT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     out: list[Limit] = []
-    for j in range(0 if m.opt.disableflags & off else m.njnt):
-        if m.jnt_limited[j] and int(m.jnt_type[j]) in SCALAR and problem.roles[j] != Role.KEYED:
-            at = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])
-            low, high = (float(x) for x in m.jnt_range[j])
-            out += [Limit(j, *at, low, -1), Limit(j, *at, high, 1)]
+    for j in limited_joints(m, keyed=np.flatnonzero(problem.roles == Role.KEYED).tolist()):
+        at = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])
+        low, high = (float(x) for x in m.jnt_range[j])
+        out += [Limit(j, *at, low, -1), Limit(j, *at, high, 1)]
     return Limits(tuple(out))

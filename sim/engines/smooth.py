@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 
 from ..errors import EngineError
-from .interface import Array, Controls, Problem, Segment
-from .limits import limits_of
-
-RESTITUTION = 0.0  # a joint that meets its limit stops there; servo arms do not bounce
+from .interface import Controls, Problem, Role, Segment
+from .limits import in_words
+from .stiffness import friction_width
 
 
 def methods() -> dict[str, int]:
@@ -32,41 +30,19 @@ def differences(problem: Problem) -> list[str]:
     """Physics that this engine models otherwise than MuJoCo, as sentences; no matter of step or order."""
     from ..dynamics.support import differences as of_model
 
-    width = width_of(problem)
-    found = [f"otherwise than MuJoCo: {line}" for line in of_model(problem.model, friction_width=width)]
-    if limits_of(problem).each:
-        found.append(f"a joint that meets its limit stops there (restitution {RESTITUTION:g})")
-    return found
+    return of_model(
+        problem.model,
+        friction_width=width_of(problem),
+        keyed=np.flatnonzero(problem.roles == Role.KEYED).tolist(),
+        at_limits=in_words(problem.restitution),
+    )
 
 
 def width_of(problem: Problem) -> float | None:
     """The `friction_width` of a problem: what it was planned with, whatever its step is now."""
     if problem.friction_width is not None:
         return problem.friction_width
-    return friction_width(problem.model, mobility(problem), problem.step)
-
-
-def friction_width(model: mujoco.MjModel, mobility: Array, step: float) -> float | None:
-    """Speed [rad/s, m/s] below which dry friction is smoothed; None without friction.
-
-    At least 0.01, and wide enough that the smoothed force is not stiff for the step: the rate
-    friction / (inertia width) stays below 1/step.
-    """
-    off = int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    if model.opt.disableflags & off or not model.dof_frictionloss.any():
-        return None
-    return max(0.01, float(np.max(model.dof_frictionloss * mobility)) * step)
-
-
-def mobility(problem: Problem) -> Array:
-    """Diagonal (nv,) of the inverse inertia matrix at the initial state [1/kg, 1/(kg m^2)]."""
-    m = problem.model
-    data = mujoco.MjData(m)
-    data.qpos[:] = problem.state0.q
-    mujoco.mj_forward(m, data)
-    inverse = np.eye(m.nv)
-    mujoco.mj_solveM(m, data, inverse, np.eye(m.nv))
-    return np.diag(inverse).copy()
+    return friction_width(problem.model, problem.state0.q, ~problem.dofs(Role.KEYED), problem.step)
 
 
 class SmoothEngine:
@@ -87,6 +63,7 @@ class SmoothEngine:
         progress: Callable[[float], None] | None = None,
     ) -> Segment:
         """See :class:`~pantograph.sim.engines.interface.Engine`."""
+        from ..dynamics.support import unlocated
         from ..integrate import TABLEAUS
         from .smooth_adaptive import AdaptiveRun
         from .smooth_fixed import FixedRun
@@ -96,5 +73,12 @@ class SmoothEngine:
             raise EngineError(
                 f"the smooth engine has no integrator {problem.integrator!r}; it has: {listing}"
             )
+        if limits := unlocated(problem.model, keyed=np.flatnonzero(problem.roles == Role.KEYED).tolist()):
+            raise EngineError(
+                f"the smooth engine cannot locate: {'; '.join(limits)}; use the contact engine, or leave "
+                "limits out (mjDSBL_LIMIT in the model, physics.limits = false in a scene)"
+            )
+        if not 0.0 <= problem.restitution <= 1.0:
+            raise EngineError(f"restitution must lie in [0, 1], not {problem.restitution:g}")
         kind = FixedRun if problem.tolerance is None else AdaptiveRun
         return kind(problem, t_span, controls, TABLEAUS[problem.integrator]).segment(progress)

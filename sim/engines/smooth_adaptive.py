@@ -10,14 +10,11 @@ import numpy as np
 
 from ..errors import EngineError
 from .interface import Array, Controls, Problem
-from .smooth_run import Run
+from .smooth_run import MOST, Run
 
 if TYPE_CHECKING:
     from ..dynamics.motion.adaptive import Follower
     from ..integrate import Tableau
-
-MOST = 1000
-"""Events without time between them."""
 
 
 class AdaptiveRun(Run):
@@ -39,6 +36,7 @@ class AdaptiveRun(Run):
         period = self.controls.period if self.controls else self.end
         ticks = max(1, int(np.ceil(self.end / period - 1e-9)))
         for k in range(ticks):
+            self.mark()
             if self.controls:
                 self.sample(k)
             if message := self._until(min(self.end, (k + 1) * period), progress):
@@ -57,6 +55,7 @@ class AdaptiveRun(Run):
         self.release()
         at_once = 0
         while self.offset < stop:
+            self.mark()
             c, begun = self.model(), self.offset
             reached = self._follower()(
                 c.gather(self.q, self.v, self.act), c.held(self.held), begun, stop, self.next_step,

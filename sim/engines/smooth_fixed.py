@@ -12,7 +12,7 @@ from ..errors import EngineError
 from .common import steps_per_tick
 from .compiled import CHUNK
 from .interface import Array, Controls, Problem
-from .smooth_run import Run
+from .smooth_run import MOST, Run
 
 if TYPE_CHECKING:
     from ..integrate import Tableau
@@ -33,6 +33,7 @@ class FixedRun(Run):
         k = 0
         while True:
             self.offset, self.done = k * self.h, k
+            self.mark()
             if message := self.nonsense():
                 return message
             if k == self.steps:
@@ -104,8 +105,7 @@ class FixedRun(Run):
 
     def _step_with_events(self, k: int) -> None:
         """One step in which joints may meet or leave limits: to each event, the event, and on to the end."""
-        most = 2 * len(self.limits.each) + 2
-        for _ in range(most):
+        for _ in range(MOST):
             left = (k + 1) * self.h - self.offset
             moment = self.first_event(left)
             if moment is None:
@@ -113,7 +113,8 @@ class FixedRun(Run):
                 return
             self.move(moment.share, left)
             self.happen(moment)
+            self.mark()
         raise EngineError(
-            f"joints met their limits more than {most} times within one step at "
+            f"joints met their limits more than {MOST} times within one step at "
             f"t = {self.t0 + k * self.h:.4g} s; use a smaller step or engine = 'contact'"
         )

@@ -14,8 +14,8 @@ from ...models import name_of
 from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
 from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
-from .limits import Limit, complementary, limits_of, slack
-from .smooth import RESTITUTION, width_of
+from .limits import Limit, complementary, limits_of, rebound, slack
+from .smooth import width_of
 from .timed import Timed
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 NARROW = 1e-12
 """Moments of events are known to this share of their step."""
 
+MOST = 1000
+"""Events within one step, or without time between them."""
 
 TOUCHING = 1e-9
 """Joints this near to a limit [rad, m] take part in an impact."""
@@ -52,6 +54,7 @@ class Run(ABC):
         self.offset = 0.0
         self.q, self.v, self.act = (np.array(x, dtype=float) for x in problem.state0)
         self.held = Held(np.zeros(problem.model.nu), np.zeros(problem.model.nv))
+        self.mark()
         self.samples: list[tuple[float, State]] = []
         self.rests: list[tuple[Limit, ...]] = []
         self.ticks: list[tuple[float, Held]] = []
@@ -67,14 +70,25 @@ class Run(ABC):
             message = self.advance(progress)
             status = "diverged" if message else "done"
         except KeyboardInterrupt:
-            status, message = "interrupted", f"interrupted at t = {self.now:.4g} s"
+            status, message = "interrupted", f"interrupted at t = {self._keep_last():.4g} s"
         except Exception as error:
             status, failure = "failed", error
-            message = f"failed at t = {self.now:.4g} s: {place_of(error)}"
+            message = f"failed at t = {self._keep_last():.4g} s: {place_of(error)}"
         segment = self.result(status, message, time.perf_counter() - started)
         if failure is not None:
             raise Broken(segment) from failure
         return segment
+
+    def mark(self) -> None:
+        """The state is whole: what a run that is stopped before the next mark ends with."""
+        self.last = self.offset, State(self.q.copy(), self.v.copy(), self.act.copy()), self.resting
+
+    def _keep_last(self) -> float:
+        """Record the last whole state of a run that was stopped; its time [s]."""
+        offset, state, self.resting = self.last
+        if not (self.samples and self.samples[-1][0] >= self.t0 + offset):
+            self.keep(offset, *state)
+        return self.t0 + offset
 
     @abstractmethod
     def advance(self, progress: Callable[[float], None] | None) -> str:
@@ -109,8 +123,8 @@ class Run(ABC):
 
     def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
         """Record a state."""
+        self.rests.append(self.resting)  # first, so that an interrupt leaves no sample without it
         self.samples.append((self.t0 + offset, State(q.copy(), v.copy(), act.copy())))
-        self.rests.append(self.resting)
 
     def roll(self, length: float) -> tuple[Array, Array, Array]:
         """The state one step of ``length`` seconds later."""
@@ -146,15 +160,17 @@ class Run(ABC):
                 self.roll(share * length)[1][limit.dof] if share > 0.0 else self.v[limit.dof]
             )
 
-        last = 1.0
+        first, last = 0.0, 1.0
         if limit.gap(q) >= 0.0:  # it may have closed and opened again: look where it is smallest
             last = float(brentq(closing, 0.0, 1.0, xtol=1e-9))
             if gap(last) >= 0.0:
                 return None
-        # where it stands on the limit, it may leave and come back
-        starts = (0.0,) if gap(0.0) > 0.0 or last < 1.0 else (1e-3, 0.03, 0.1, 0.3, 0.6, 0.9)
-        first = next((share for share in starts if gap(share) > 0.0), None)
-        return 0.0 if first is None else float(brentq(gap, first, last, xtol=NARROW))
+        elif gap(0.0) <= 0.0 and closing(0.0) < 0.0 < closing(1.0):  # it leaves the limit and comes back
+            first = float(brentq(closing, 0.0, 1.0, xtol=NARROW))
+        if gap(first) <= 0.0:
+            tries = (share for share in (1e-3, 0.03, 0.1, 0.3, 0.6, 0.9) if share < last)
+            first = next((share for share in tries if gap(share) > 0.0), 0.0)
+        return first if gap(first) <= 0.0 else float(brentq(gap, first, last, xtol=NARROW))
 
     def _force(self, i: int, share: float, length: float) -> float:
         """Force of the limit on the joint that rests on it, a share of the step from here."""
@@ -217,8 +233,8 @@ class Run(ABC):
         """An impact on the limit ``hit``, if any, and which joints rest on their limits from here on.
 
         Of the joints at their limits, impulses p and velocities u away from them satisfy u+ = u + W p >= 0,
-        p >= 0, p u+ = 0, W = J M^-1 J' (with restitution e: W p + (1 + e) u in place of u+); of those that
-        stay, forces and accelerations do likewise (R. Featherstone, Rigid Body Dynamics Algorithms, ch. 11).
+        p >= 0, p u+ = 0, W = J M^-1 J', or rebound (see `rebound`); of those that stay, forces and
+        accelerations do likewise (R. Featherstone, Rigid Body Dynamics Algorithms, ch. 11).
         """
         gaps = self.limits.gaps(self.q[None])[0]
         at = [
@@ -232,15 +248,15 @@ class Run(ABC):
         w = c.at(np.array([self.offset]))[0]
         inverse = np.linalg.inv(c.smooth.mass_matrix(self.q[c.q_free], w=w))[:, dof] * side
         W = side[:, None] * inverse[dof]
-        stays = np.ones(len(at), dtype=bool)
+        u = side * self.v[c.v_free[dof]]
+        impulse = np.zeros(len(at))
         if hit is not None:
             self._note("limit", hit)
             self.q[hit.qpos] = hit.bound
-            u = side * self.v[c.v_free[dof]]
-            p = complementary(W, (1.0 + RESTITUTION) * u)
-            self.v[c.v_free] += inverse @ p
-            stays = u + W @ p <= 1e-12 * (1.0 + np.abs(u).max())
-            self.v[c.v_free[dof[stays]]] = 0.0
+            impulse = rebound(W, u, self.problem.restitution)
+            self.v[c.v_free] += inverse @ impulse
+        stays = np.abs(u + W @ impulse) <= 1e-12 * (1.0 + np.abs(u).max(initial=0.0))
+        self.v[c.v_free[dof[stays]]] = 0.0
         a = c.smooth.forward(self.q[c.q_free], self.v[c.v_free], c.held(self.held), act=self.act, w=w)
         away, W = side[stays] * a[dof[stays]], W[np.ix_(stays, stays)]
         force = complementary(W, away)
@@ -320,7 +336,7 @@ class Run(ABC):
             "build_s": self.build_s,
             "build_cached": all(b.cached for b in builds),
             "friction_width": self.width,
-            "restitution": RESTITUTION if self.limits.each else None,
+            "restitution": self.problem.restitution if self.limits.each else None,
         }
         return Segment(
             **recorded(self.problem.model, kept, self.ticks),

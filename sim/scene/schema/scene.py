@@ -18,7 +18,7 @@ from pydantic import (
 
 from ..fitting import FitItem
 from ..mistakes import report
-from ..values import Pair, Positive, Row, Switch, Vector, at
+from ..values import NotNegative, Pair, Positive, Row, Switch, Vector, at
 from ..words import mistakes_of
 from .film import CameraItem, FilmItem, LightItem
 from .item import Item
@@ -63,6 +63,9 @@ class Physics(Item):
         "model", description="as the model file has them, none, or pairs of bodies or geoms"
     )
     limits: Switch = True
+    restitution: NotNegative = Field(
+        0.0, le=1, description="part of its speed with which a joint rebounds from its limit; smooth engine"
+    )
     friction: Switch = Field(True, description="dry friction of joints and tendons")
     gravity: Switch | Vector = True
 
