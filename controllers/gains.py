@@ -25,21 +25,17 @@ def number(what: str, value: object) -> float:
 
 def positive(what: str, value: object, *, zero: bool = False) -> float:
     """``value`` if it is a positive number (or zero, if that may be), else PantographError."""
-    if isinstance(value, Real) and not isinstance(value, bool) and np.isfinite(float(value)):
-        if float(value) > 0 or (zero and value == 0):
-            return float(value)
+    exact = number(what, value)
+    if exact > 0 or (zero and exact == 0):
+        return exact
     raise PantographError(f"{what} must be a {'number >= 0' if zero else 'positive number'}, got {value!r}")
 
 
 def whole(what: str, value: object, *, least: int = 1) -> int:
     """``value`` if it is a whole number of at least ``least``, else PantographError."""
-    if (
-        isinstance(value, Real)
-        and not isinstance(value, bool)
-        and float(value).is_integer()
-        and value >= least
-    ):
-        return int(value)
+    exact = number(what, value)
+    if exact.is_integer() and exact >= least:
+        return int(exact)
     raise PantographError(f"{what} must be a whole number >= {least}, got {value!r}")
 
 

@@ -65,7 +65,7 @@ class LQR:
         goal: Mapping[str, float] | None = None,
     ) -> None:
         self.model, self.tracked, self.keyed = model, tracked, keyed
-        clip, self.unkeyed = aimed(clip, goal or {}, "the LQR's goal")
+        clip, self.unkeyed = aimed(clip, {} if goal is None else goal, "the LQR's goal")
         self.period, self.preview = period, Preview(clip, period, duration)
         self.nominal = Nominal(model)
         moving = ~keyed

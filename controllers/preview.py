@@ -62,8 +62,8 @@ class Preview:
 def aimed(clip: Clip, goal: Mapping[str, float], what: str) -> tuple[Clip, NDArray[np.bool_]]:
     """``clip`` with joints that have no keys at ``goal`` (joint -> value), and the mask (nq,) of these.
 
-    Raises PantographError, saying ``what`` it is about, for names that are no hinge or slide, or have keys, and
-    for values that are no numbers.
+    Raises PantographError, saying ``what`` it is about, for names that are no hinge or slide, or have keys,
+    and for values that are no numbers.
     """
     model, q0, mask = clip.model, clip.q0.copy(), np.zeros(clip.model.nq, dtype=bool)
     if not isinstance(goal, Mapping):

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim.control import Law, Target
 from ..models import name_of
+from ..sim.control import Law, Target
 from ..sim.errors import PantographError
 from ..sim.kinds import SCALAR
 from .gains import Gain, choice, felt_inertia, force_limits, limit_per_joint, per_joint, positive

@@ -23,7 +23,7 @@ from ..models import joint_names
 from ..sim.control import Target
 from ..sim.errors import PantographError, unknown
 from .basin import Catch, advance, comes_home
-from .gains import force_limits, number, positive, whole
+from .gains import force_limits, positive, whole
 from .nominal import Nominal
 
 Array = NDArray[np.float64]

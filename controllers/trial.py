@@ -6,7 +6,7 @@ import copy
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -19,6 +19,7 @@ from ..sim.engines.interface import Controls, Held, Problem, Role
 from ..sim.plan import Plan
 from .gains import force_limits
 from .nominal import difference
+from .reality import LoopMemory
 
 Array = NDArray[np.float64]
 _BAND = 0.02  # of its motion: a joint that stays this near to its last key has settled
@@ -44,10 +45,12 @@ class Figures:
     """What one trial measured, over the tracked joints.
 
     ``rms``, ``worst``: errors [rad, m]; ``effort``: RMS of all joint forces together [N m, N]; ``work``: sum
-    of |force x speed| [J]; ``saturated``: part of the samples where a drive gave all it could; ``settling``
-    [s] after the keys rest until every joint stays within 2 % of its motion (infinite: it does not; NaN: the
-    keys move until the end); ``overshoot`` beyond the last key, of the motion; ``tick``, ``tick99`` [s]:
-    median and 99th percentile of the law's time a sample; ``status`` of the run, and why it ended early.
+    of |force x speed| [J]; ``saturated``: part of the samples where a drive gave all it could, sooner where
+    the law's reality says so; ``settling`` [s] after the keys rest until every joint stays within 2 % of its
+    motion, or, where it has none, of the largest motion of its kind (infinite: it does not; NaN: the keys
+    move until the end, or no joint has anything to do); ``overshoot`` beyond the last key, of the motion;
+    ``build`` [s]: what it took to make the law and a first sample; ``tick``, ``tick99`` [s]: median and 99th
+    percentile of the law's time a sample after that; ``status`` of the run, and why it ended early.
     """
 
     rms: float
@@ -57,6 +60,7 @@ class Figures:
     saturated: float
     settling: float
     overshoot: float
+    build: float
     tick: float
     tick99: float
     status: str
@@ -73,12 +77,24 @@ class Trial:
     tau: Array
 
 
+class _Sample(NamedTuple):
+    """What a law saw and gave at a sample, which drives gave all they could, and its time [s]."""
+
+    t: float
+    q: Array
+    v: Array
+    target: Target
+    tau: Array
+    cut: NDArray[np.bool_]
+    seconds: float
+
+
 class _Watched:
     """A law that keeps what it saw and gave, and how long it took; the measuring end of a trial."""
 
-    def __init__(self, law: Law) -> None:
-        self.law = law
-        self.seen: list[tuple[float, Array, Array, Target, Array, float]] = []
+    def __init__(self, law: Law, limits: tuple[Array, Array]) -> None:
+        self.law, (self.low, self.high) = law, limits
+        self.seen: list[_Sample] = []
 
     def start(self) -> Any:
         return self.law.start()
@@ -86,7 +102,9 @@ class _Watched:
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: Any) -> tuple[Array, Any]:
         begun = time.perf_counter()
         tau, memory = self.law(t, q, v, target, memory)
-        self.seen.append((t, q, v, target, tau, time.perf_counter() - begun))
+        took = time.perf_counter() - begun
+        cut = memory.cut if isinstance(memory, LoopMemory) else (tau <= self.low) | (tau >= self.high)
+        self.seen.append(_Sample(t, q, v, target, tau, cut, took))
         return tau, memory
 
 
@@ -111,7 +129,14 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     """
     problem, period = plan.problem, plan.period
     assert period is not None
-    watched = _Watched(make_law(law, problem, dict(words), period))
+    begun = time.perf_counter()
+    made = make_law(law, problem, dict(words), period)
+    q, v, _ = problem.state0
+    made(
+        0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start()
+    )  # laws build what they need when called
+    build = time.perf_counter() - begun
+    watched = _Watched(made, force_limits(problem.model))
     true = _disturbed(problem, disturbance)
     controls = _Pushed(Sampled(watched, true, period), disturbance)
     try:
@@ -120,7 +145,7 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
         if not watched.seen:
             raise
         segment = broken.segment
-    return _measured(problem, watched, segment.status, segment.message)
+    return _measured(problem, watched.seen, build, segment.status, segment.message)
 
 
 def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
@@ -134,27 +159,26 @@ def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
     return replace(problem, model=model)
 
 
-def _measured(problem: Problem, watched: _Watched, status: str, message: str) -> Trial:
+def _measured(problem: Problem, seen: list[_Sample], build: float, status: str, message: str) -> Trial:
     m, tracked = problem.model, problem.dofs(Role.TRACKED)
-    t = np.array([row[0] for row in watched.seen])
-    error = np.array([difference(m, row[1], row[3].q) for row in watched.seen])[:, tracked]
-    v, tau = (np.array([row[i] for row in watched.seen])[:, tracked] for i in (2, 4))
-    low, high = (limit[tracked] for limit in force_limits(m))
-    given = np.clip(tau, low, high)
-    seconds = np.array([row[5] for row in watched.seen])
-    at_limit = (tau <= low) | (tau >= high)
+    t = np.array([row.t for row in seen])
+    error = np.array([difference(m, row.q, row.target.q) for row in seen])[:, tracked]
+    v, tau, cut = (np.array([getattr(row, word) for row in seen])[:, tracked] for word in ("v", "tau", "cut"))
+    given = np.clip(tau, *(limit[tracked] for limit in force_limits(m)))
+    seconds = np.array([row.seconds for row in seen])
     finite = bool(np.isfinite(error).all()) and status == "done"
     settling, overshoot = np.inf, np.inf
     if finite:
-        settling, overshoot = _arrival(t, error, [row[3] for row in watched.seen], tracked, m)
+        settling, overshoot = _arrival(t, error, [row.target for row in seen], tracked, m)
     figures = Figures(
         rms=float(np.sqrt(np.mean(error**2))) if finite else np.inf,
         worst=float(np.abs(error).max()) if finite else np.inf,
         effort=float(np.sqrt(np.mean(np.sum(given**2, axis=1)))),
         work=float(np.sum(np.abs(given * v)) * (t[1] - t[0])) if len(t) > 1 else 0.0,
-        saturated=float(at_limit.any(axis=1).mean()),
+        saturated=float(cut.any(axis=1).mean()),
         settling=settling,
         overshoot=overshoot,
+        build=build,
         tick=float(np.median(seconds)),
         tick99=float(np.percentile(seconds, 99)),
         status=status,
@@ -171,11 +195,15 @@ def _arrival(
     way = np.array([difference(m, target.q, last) for target in targets])[:, tracked]
     moving = np.flatnonzero((np.abs(way) > 1e-9).any(axis=1) | [x.v[tracked].any() for x in targets])
     rest = int(moving[-1]) + 1 if len(moving) else 0
-    scale = np.maximum(np.abs(way + error).max(axis=0), 1e-12)
-    start = np.where(np.abs(way[0]) > 1e-9, way[0], error[0])
+    start = way[0] + error[0]
+    scale = np.maximum(np.abs(way).max(axis=0), np.abs(start))
+    angles = np.asarray(m.jnt_type[m.dof_jntid[tracked]] != mujoco.mjtJoint.mjJNT_SLIDE)
+    for kind in (angles, ~angles):
+        scale[kind] = np.where(scale[kind] > 1e-9, scale[kind], scale[kind].max(initial=0.0))
     left = error[rest:]
-    if not len(left):
+    if not len(left) or not (scale > 1e-9).any():
         return np.nan, 0.0
+    scale = np.where(scale > 1e-9, scale, np.inf)  # nothing of its kind has anything to do
     outside = np.flatnonzero((np.abs(left) > _BAND * scale).any(axis=1))
     settling = 0.0 if not len(outside) else np.inf
     if len(outside) and outside[-1] + 1 < len(left):

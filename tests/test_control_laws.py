@@ -14,6 +14,7 @@ from pantograph.controllers.nominal import Nominal, difference
 from pantograph.controllers.observers import Kalman, VelocityFilter
 from pantograph.controllers.operational_space import OperationalSpace
 from pantograph.controllers.pid import PID
+from pantograph.controllers.play import Play, Rotors
 from pantograph.controllers.reality import Loop
 from pantograph.controllers.task import Task
 from pantograph.models import load_model
@@ -332,6 +333,68 @@ def test_play_hides_at_most_half_its_width_and_no_motion_smaller_than_it(width, 
             assert (np.sign(shown - last)[moved] == np.sign(step)[moved]).all()
 
 
+def geared(width=0.1, armature=0.02, period=0.01):
+    model = load_model("double_pendulum")
+    model.dof_armature[:] = armature
+    return Play(model, np.array([width, 0.0]), period), model
+
+
+@given(st.floats(0.01, 0.3), st.floats(0.005, 0.1), st.floats(0.2, 5.0))
+def test_a_rotor_crosses_its_gap_as_a_free_body(width, inertia, torque):
+    """From one flank to the other in sqrt(2 width J / tau): until then nothing arrives, then all that was
+    put into the rotor, then the torque."""
+    play, _ = geared(width, inertia, period=1e-3)
+    still, rotors, given_ = np.zeros(2), Rotors(np.array([-width / 2, 0.0]), np.zeros(2)), []
+    crossing = np.sqrt(2 * width * inertia / torque)
+    for _ in range(int(crossing / 1e-3) + 5):
+        tau, rotors = play.pass_on(np.array([torque, torque]), still, still, rotors)
+        given_.append(tau[0])
+        assert tau[1] == torque
+    k = int(crossing / 1e-3 - 1e-6)  # rounding may tell a crossing at a sample as before it
+    np.testing.assert_allclose(given_[:k], 0, atol=1e-12)
+    np.testing.assert_allclose(np.sum(given_) * 1e-3, torque * 1e-3 * len(given_), rtol=1e-9)
+    np.testing.assert_allclose(given_[k + 2 :], torque)
+
+
+@given(seeds, st.floats(-2.0, 2.0))
+def test_play_loses_no_impulse(seed, speed):
+    """Whatever the torques, beside a joint that moves evenly: what arrived and what is in the rotor."""
+    rng, (play, model) = np.random.default_rng(seed), geared()
+    q, v = np.array([0.3, 0.0]), np.array([speed, 0.0])
+    rotors, put, got = play.start(q, v), 0.0, 0.0
+    for k in range(200):
+        tau = rng.normal(size=2) * (k < 150 or rng.uniform() < 0.5)
+        at = q + 0.01 * k * v
+        given_, rotors = play.pass_on(tau, at, v, rotors)
+        put, got = put + 0.01 * tau[0], got + 0.01 * given_[0]
+        gap = rotors.q[0] - (at[0] + 0.01 * speed)
+        assert abs(gap) <= 0.05 + 1e-9
+        assert put == pytest.approx(got + model.dof_armature[0] * (rotors.v[0] - speed), abs=1e-9)
+
+
+def test_dry_friction_stops_and_does_not_shake():
+    """Friction that would turn a light body round within a period stops it instead."""
+    model = _with_motor(force=50.0)
+    loop = Loop(_Still(), model, ALL[:1], model.qpos0, 0.02, friction=5.0)
+    v, inertia, memory = np.array([0.3]), felt_inertia(model, model.qpos0)[0], loop.start()
+    for _ in range(50):
+        before = v[0]
+        tau, memory = loop(0.0, np.zeros(1), v, None, memory)
+        v = v + 0.02 * tau / inertia
+        assert 0.0 <= v[0] <= before
+    assert v[0] < 1e-3
+
+
+class _Still:
+    """No force."""
+
+    def start(self):
+        return None
+
+    def __call__(self, t, q, v, target, memory):
+        return np.zeros(len(v)), None
+
+
 def test_a_loop_cuts_forces_as_the_motor_does():
     model = _with_motor(force=8.0)
     loop = Loop(_Echo(), model, ALL[:1], model.qpos0, 0.01, saturation=0.5, top_speed=10.0, friction=0.0)
@@ -339,6 +402,11 @@ def test_a_loop_cuts_forces_as_the_motor_does():
     for speed, asked, given_ in ((0, 9, 4), (5, 9, 2), (5, -9, -4), (-5, -9, -2), (12, 9, 0), (0, 1, 1)):
         tau, _ = loop(0.0, np.array([float(asked)]), np.array([float(speed)]), still, loop.start())
         assert tau[0] == pytest.approx(given_)
+    # what friction takes is taken of what the drive can give, not of what was asked
+    loop = Loop(_Echo(), model, ALL[:1], model.qpos0, 0.01, friction=1.0)
+    tau, memory = loop(0.0, np.array([99.0]), np.array([50.0]), still, loop.start())
+    assert tau[0] == pytest.approx(7.0)
+    assert memory.cut[0]
     low, high = force_limits(model)
     assert (low[0], high[0]) == (-8.0, 8.0)
 
@@ -386,6 +454,24 @@ def test_learning_removes_what_the_model_does_not_know():
         ("lqr", {"goal": {"waist": 0.0}}, "no joint without keys 'waist'"),
         ("mpc", {"horizon": 0.0}, "horizon must be a positive"),
         ("pd", {"observer": "eyes"}, "no observer 'eyes'"),
+        ("pd", {"gravity": "no"}, "gravity must be true or false"),
+        ("pd", {"kp": "hard"}, "kp must be a number, got 'hard'"),
+        ("pd", {"kd": {"elbow": float("nan")}}, "kd of 'elbow' must be a number, got nan"),
+        ("pid", {"filter": True}, "filter must be a number, got True"),
+        ("pid", {"windup": 0}, "windup must be a positive"),
+        ("impedance", {"site": 3}, "site = one of tip"),
+        ("lqr", {"goal": 0.3}, "a value for each joint"),
+        ("lqr", {"position": {"waist": -1.0}}, "position of 'waist' must be a number >= 0"),
+        ("mpc", {"fine": 0.5}, "fine must be a whole number >= 1, got 0.5"),
+        ("mpc", {"slew": 0.0}, "slew must be a positive"),
+        ("mpc", {"speed": {"elbow": 0.0}}, "speed of 'elbow' must be a positive"),
+        ("nmpc", {"iterations": 0.5}, "iterations must be a whole number >= 1"),
+        ("nmpc", {"step": float("inf")}, "step must be a number, got inf"),
+        ("nmpc", {"goal": {"waist": 0.0}}, "no joint without keys 'waist'"),
+        ("pd", {"top_speed": 3.0}, "top_speed needs to know what the drive of 'waist' can give"),
+        ("pd", {"saturation": 0.5}, "saturation needs to know what the drive"),
+        ("pd", {"delay": "1ms"}, "delay must be a number"),
+        ("pd", {"corner": -1.0}, "corner must be a positive"),
         ("pd", {"detay": 1}, "did you mean 'delay'"),
     ],
 )

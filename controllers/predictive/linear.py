@@ -58,8 +58,8 @@ class MPC:
     Looks ``horizon`` [s] ahead by the model's exact linearisation along the keys. Weights ``position``,
     ``velocity``, ``force`` and ``goal`` are LQR's. What drives can give is a hard limit, and so is ``slew``
     [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed`` [rad/s, m/s] are soft:
-    the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one period each, later ones 2, 4, 8,
-    ...; limits are looked at where moves meet.
+    the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one
+    period each, later ones 2, 4, 8, ...; limits are looked at where moves meet.
     """
 
     def __init__(

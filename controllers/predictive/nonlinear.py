@@ -17,15 +17,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import joint_names
 from ...sim.clip import Clip
 from ...sim.compile.program import Bound
 from ...sim.control import Target
-from ...sim.errors import PantographError, unknown
+from ...sim.errors import PantographError
 from ..design.linear import held_matrices, linearise_path
 from ..design.riccati import dlqr
-from ..gains import Gain, force_limits, per_joint, positive
+from ..gains import Gain, force_limits, force_weights, per_joint, positive, whole
 from ..nominal import Nominal
+from ..preview import aimed
 
 Array = NDArray[np.float64]
 
@@ -82,11 +82,10 @@ class NMPC:
     ) -> None:
         if model.nq != model.nv or keyed.any():
             raise PantographError("nonlinear MPC takes models of hinges and slides without keyed joints")
-        self.model, self.tracked, self.clip, self.period = model, tracked, clip, period
-        self.step, self.iterations = (
-            positive("the NMPC's step", step),
-            int(positive("iterations", iterations)),
-        )
+        self.clip, _ = aimed(clip, {} if goal is None else goal, "the NMPC's goal")
+        self.model, self.tracked, self.period = model, tracked, period
+        self.step = positive("the NMPC's step", step)
+        self.iterations = whole("the NMPC's iterations", iterations)
         self.n = max(1, round(positive("the NMPC's horizon", horizon) / step))
         self.nominal, self.inputs = Nominal(model), np.flatnonzero(tracked)
         low, high = force_limits(model)
@@ -96,26 +95,13 @@ class NMPC:
             for w, g in (("position", position), ("velocity", velocity))
         ]
         self.Q = np.concatenate(weights) * step
-        if force is None:
-            able = np.minimum(-low, high)
-            scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(self.nominal.weight(q0))))
-            effort = 1.0 / np.maximum(scale, 1e-9) ** 2
-        else:
-            effort = per_joint(model, "the NMPC's force", force)
-        if not (effort[self.inputs] > 0).all():
-            raise PantographError("the NMPC's force: every joint that it drives must cost something")
-        self.R = effort[self.inputs] * step
+        weight = self.nominal.weight(q0)
+        self.R = force_weights(model, tracked, force, weight, "the NMPC's") * step
         limited = np.array([bool(model.jnt_limited[j]) for j in model.dof_jntid])
         ranges = model.jnt_range[model.dof_jntid]
         self.q_low = np.where(limited, ranges[:, 0], -np.inf)
         self.q_high = np.where(limited, ranges[:, 1], np.inf)
         self.soft = positive("the NMPC's soft", soft, zero=True) * np.maximum(self.Q[: model.nv], 1e-12)
-        self.unkeyed = {}
-        names = joint_names(model)
-        for name, value in (goal or {}).items():
-            if name not in names:
-                raise PantographError(f"the NMPC's goal: {unknown('joint', name, names)}")
-            self.unkeyed[int(model.jnt_qposadr[names.index(name)])] = value
 
     @cached_property
     def final(self) -> Array:
@@ -133,8 +119,6 @@ class NMPC:
         ends = np.concatenate([[t], (gone + 1 + np.arange(self.n)) * self.step])
         middle = self.clip.evaluate(0.5 * (ends[1:] + ends[:-1]))
         q, v, _ = self.clip.evaluate(ends)
-        for column, value in self.unkeyed.items():
-            q[:, column] = middle.q[:, column] = value
         tau = self.nominal.smooth.inverse(middle.q, middle.v, middle.a)
         return Horizon(np.hstack([q, v]), tau[:, self.inputs], np.diff(ends))
 
