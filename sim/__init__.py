@@ -6,7 +6,7 @@
 (251, 1)
 
 What it names is imported when it is asked for: who uses machine code or inverse kinematics alone does not
-wait for scenes.
+wait for scenes, and the command line can be interrupted from its first moment.
 """
 
 import sys
@@ -14,9 +14,16 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from .errors import EngineError, FilmError, ModelError, PantographError, RecordingError, RunError, SceneError
-
 if TYPE_CHECKING:
+    from .errors import (
+        EngineError,
+        FilmError,
+        ModelError,
+        PantographError,
+        RecordingError,
+        RunError,
+        SceneError,
+    )
     from .plan import Plan, make_plan
     from .plots import plot
     from .recording import ErrorEstimate, Recording, load
@@ -47,6 +54,7 @@ __all__ = [
 ]
 
 _HOME = {"plot": "plots", "run": "run", "shoot": "shoot", "Scene": "scene.schema"}
+_HOME |= dict.fromkeys([name for name in __all__ if name.endswith("Error")], "errors")
 _HOME |= dict.fromkeys(["Plan", "make_plan"], "plan")
 _HOME |= dict.fromkeys(["ErrorEstimate", "Recording", "load"], "recording")
 _HOME |= dict.fromkeys(["load_scene", "parse_scene"], "scene.load")
@@ -58,6 +66,7 @@ class _FrontDoor(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in _HOME:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        import_module("..models", self.__name__)  # first: it says why MuJoCo does not load, where it does not
         value = getattr(import_module(f".{_HOME[name]}", self.__name__), name)
         self.__dict__[name] = value
         return value

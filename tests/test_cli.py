@@ -380,9 +380,18 @@ def test_a_setting_of_mujoco_that_cannot_work_is_named(folder):
     environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYTHONPATH": str(folder)}
     environment["PYTHONPATH"] += os.pathsep + os.environ.get("PYTHONPATH", "")
     process = subprocess.run(
-        [sys.executable, "-c", "import pantograph.sim"], env=environment, capture_output=True, text=True
+        [sys.executable, "-c", "from pantograph.sim import run"],
+        env=environment,
+        capture_output=True,
+        text=True,
     )
-    assert "MuJoCo does not load with MUJOCO_GL = 'osmesa' (no glGetError): unset it" in process.stderr
+    says = "MuJoCo does not load with MUJOCO_GL = 'osmesa' (no glGetError): unset it"
+    assert says in process.stderr
+    process = subprocess.run(
+        [sys.executable, "-m", "pantograph.sim", "models"], env=environment, capture_output=True, text=True
+    )
+    assert process.returncode == 2
+    assert process.stderr.startswith("error: " + says)
 
 
 def test_the_models_of_the_data_folder_are_listed(pantograph, folder, monkeypatch):

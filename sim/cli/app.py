@@ -11,8 +11,12 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from ...controllers.cli import control, gains
+from ...controllers.fit.command import fit
+from ...hardware.cli import app as servo
 from ..errors import PantographError, RunError
 from . import show
+from .ik import ik
 from .template import TEMPLATE
 
 app = typer.Typer(
@@ -31,16 +35,6 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (.npz) made by 'p
 
 def run_app() -> None:
     """Run the command line; mistakes are told in words, without a traceback."""
-    from ...controllers.cli import control, gains
-    from ...controllers.fit.command import fit
-    from ...hardware.cli import app as servo
-    from .ik import ik
-
-    app.add_typer(servo)
-    app.command(epilog="Example: pantograph ik arm6 --site tip --to 0.4,0.1,0.5 --film reach.mp4")(ik)
-    app.command(epilog="Example: pantograph control wave.toml --compare pd,computed-torque")(control)
-    app.command(epilog="Example: pantograph gains wave.toml --law lqr")(gains)
-    app.command(epilog="Example: pantograph fit wave.toml")(fit)
     try:
         app()
     except PantographError as e:
@@ -229,6 +223,13 @@ def schema() -> None:
     from ..scene.schema import Scene
 
     typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
+
+
+app.add_typer(servo)
+app.command(epilog="Example: pantograph ik arm6 --site tip --to 0.4,0.1,0.5 --film reach.mp4")(ik)
+app.command(epilog="Example: pantograph control wave.toml --compare pd,computed-torque")(control)
+app.command(epilog="Example: pantograph gains wave.toml --law lqr")(gains)
+app.command(epilog="Example: pantograph fit wave.toml")(fit)
 
 
 def _foresee(plan: Any, out: Path, film: Path | None, rig: str | None) -> None:
