@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ModelError
 from .chains.closed_form import ClosedForm, closed_form
 from .goals import Goal
-from .numeric.descend import Descent, tighten
-from .numeric.nearest import settle_nearest, sharpen
+from .numeric.descend import tighten
+from .numeric.nearest import brought, settle_nearest
 from .numeric.search import AT_LIMIT, Search
 from .numeric.settle import Settled, Wish, settle, settle_near, worth
 from .preferences import FAINT, Preference, chosen, closest, preference, wishes
@@ -75,7 +75,7 @@ def solve(
     if len(found) and (all or not near):  # what is best may lie far from the start
         found = np.concatenate([found, search.more(restarts if all else 40)])
     if not len(found):
-        nearest = _nearest(judged, search.best)
+        nearest = brought(search)
         reason = diagnose(judged, search, nearest)
         found = reason.found
     if len(found):
@@ -158,12 +158,6 @@ def distinct(space: Space, q: Array, *, apart: float = 1e-3) -> Array:
                 continue
         kept.append(x)
     return np.array(kept)
-
-
-def _nearest(judged: Problem, best: Descent) -> Descent:
-    """The best of the nearest poses found, sharpened."""
-    ends = [sharpen(judged, q) for q in best.q[:3]]
-    return min(ends, key=lambda end: float(end.cost[0]))
 
 
 def _solved_words(problem: Problem, q: Array) -> str:

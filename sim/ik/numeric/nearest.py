@@ -15,7 +15,8 @@ from ..goals import Rows
 from ..problem import Problem
 from ..space import Space
 from .descend import Descent, descend, held_projection
-from .settle import Wish
+from .search import Search
+from .settle import Wish, settle
 
 Array = NDArray[np.float64]
 _CLOSED = 1e3  # residuals of equalities beside those of goals
@@ -24,11 +25,19 @@ _FIRST = 1e2  # residuals of goals beside those of wishes
 
 def sharpen(problem: Problem, q: Array, *, iterations: int = 40) -> Descent:
     """Nearest pose, from q (nq,) near it, with the model's equalities closed; `Descent` of one."""
-    x = _newton(problem, q, _goals(problem), None, iterations)
+    x = _along_loops(problem, q) if problem.loops else q
+    x = _newton(problem, x, _goals(problem), None, iterations)
     if problem.loops:
         x = _closed(problem, x)
     raw = problem.raw(x[None])
     return Descent(x[None], raw.r, _square(problem.weighted(raw).r), iterations, problem.met(raw.r))
+
+
+def brought(search: Search) -> Descent:
+    """The best of the nearest poses that a search came to, after `sharpen`."""
+    ends = [sharpen(search.problem, q) for q in search.best.q[:4]]
+    search.brought = [float(end.cost[0]) for end in ends]
+    return min(ends, key=lambda end: float(end.cost[0]))
 
 
 def settle_nearest(problem: Problem, end: Descent, wish: Wish, *, iterations: int = 40) -> Array:
@@ -56,6 +65,14 @@ def _goals(problem: Problem) -> Wish:
         return Rows(w.r * heavy, w.J * heavy[:, None])
 
     return rows
+
+
+def _along_loops(problem: Problem, q: Array) -> Array:
+    """q (nq,) taken onto the equalities and along them towards the goals, where these can be closed."""
+    loops, x = problem.closures(), _closed(problem, q)
+    if not loops.met(loops.raw(x[None]).r)[0]:
+        return q
+    return settle(loops, x, lambda y: problem.weighted(problem.raw(y))).q
 
 
 def _closed(problem: Problem, q: Array) -> Array:

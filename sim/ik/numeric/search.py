@@ -24,7 +24,7 @@ class Search:
 
     Attributes:
         used, iterations: random starts and iterations so far; never more starts than `restarts`.
-        ends: costs of all attempts that failed.
+        ends: costs of all attempts that failed; brought: of the best of them after `nearest.brought`.
         hopeless: asked once after the first starts; if it says so, few more are tried, for the nearest pose.
     """
 
@@ -40,6 +40,7 @@ class Search:
         self.problem, self.start, self.restarts, self.hopeless = problem, start, restarts, hopeless
         self.used = self.iterations = 0
         self.ends: list[float] = []
+        self.brought: list[float] = []
         self._seed, self._asked = seed, restarts
         self._all: list[Descent] = []
 
@@ -121,8 +122,10 @@ class Search:
         return np.random.default_rng(self._seed)
 
     def agreed(self) -> int:
-        """How many failed attempts ended as near as the nearest, within 0.1 %."""
-        if not self.ends:
-            return 0
-        least = min(self.ends)
-        return int(np.sum(np.array(self.ends) <= least * 1.001 + 1e-15))
+        """How many failed attempts, or the best of them brought to their ends, came equally near."""
+        return max(_alike(self.ends), _alike(self.brought))
+
+
+def _alike(costs: list[float]) -> int:
+    """How many are the least, within 0.1 %."""
+    return int(np.sum(np.array(costs) <= min(costs) * 1.001 + 1e-15)) if costs else 0

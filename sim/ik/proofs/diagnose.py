@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..chains.closed_form import closed_form
 from ..goals import Goal, Orientation, Pose, Position, Rows
 from ..numeric.descend import Descent, descend
-from ..numeric.nearest import sharpen
+from ..numeric.nearest import brought
 from ..numeric.search import Search
 from ..numeric.settle import settle
 from ..problem import Problem, freedom_names, unwound
@@ -207,8 +207,7 @@ def _closest(problem: Problem, search: Search) -> Descent:
     search.iterations += part.iterations
     if len(found):
         return descend(problem, found[:1])
-    ends = [sharpen(problem, q) for q in part.best.q[:2]]
-    return min(ends, key=lambda end: float(end.cost[0]))
+    return brought(part)
 
 
 def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> float:
@@ -258,7 +257,7 @@ def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
             found = part.solutions(search.best.q[:6])
             if len(found):
                 continue
-            end = min((sharpen(alone, q) for q in part.best.q[:2]), key=lambda e: float(e.cost[0]))
+            end = brought(part)
             inner = (
                 _out_of_reach(alone, part, end, goal, NO_GAP)
                 if free is None
