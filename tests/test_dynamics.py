@@ -1,5 +1,6 @@
 """The smooth engine against MuJoCo, closed laws, and exact derivatives."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from pantograph.sim.compile.jit import preferred_lanes
 from pantograph.sim.curves import keyed
 from pantograph.sim.dynamics import LinearFeedback, compile_model, joint_pd, unsupported
+from pantograph.sim.dynamics.derivatives import JACOBIANS
 from pantograph.sim.dynamics.functions import FORMULATIONS, FUNCTIONS
 from pantograph.sim.dynamics.layout import Layout, keyed_joints
 from pantograph.sim.dynamics.motion.prescribed import pieces_of
@@ -94,7 +96,7 @@ def forwarded(model, q, v, act=(), u=()):
 
 def value(eq, name, kind="composite", **given):
     """Function `name` of the equations by NumPy, without a compiler; what is not given is zero."""
-    tape = FUNCTIONS[name](eq, kind)
+    tape = JACOBIANS[name](eq, 1) if name in JACOBIANS else FUNCTIONS[name](eq, kind)
     out = tape.evaluate(*(np.asarray(given.get(k, np.zeros(n))) for k, n in tape.inputs.items()))
     return dict(zip(tape.outputs, out, strict=True))
 
@@ -372,6 +374,45 @@ def test_compiled_laws_and_keyed_motion_run_together_to_a_tolerance(arms):
         x = part.x[-1]
         np.testing.assert_allclose(path.x[k + 1], x, rtol=0, atol=1e-10)
     np.testing.assert_allclose(path.u, u, rtol=0, atol=1e-9)
+
+
+def test_a_function_that_controls_is_called_once_a_period_and_held(arms):
+    """The compiled law and the same in Python; the last period is cut, records lie on and between samples."""
+    smooth, hold = arms["a"], 0.05
+    curve = keyed([0.0, 0.2, 0.47], [0.0, 0.5, 0.1], kind="linear")  # one of its jumps is at a sample
+    K = np.array([[0.0, 0.0], [3.0, 0.4]])
+    times = np.unique([*np.linspace(0.0, 0.47, 33), 0.1, 0.15, 0.2 + 1e-12])
+    given = {"w": keyed_by(curve), "breaks": curve.breaks, "hold": hold, "method": TABLEAUS["dop853"]}
+    given |= {"rtol": 1e-12, "atol": 1e-12}
+    asked = []
+
+    def law(t, q, v):
+        asked.append(t)
+        return -(np.concatenate([q, v], axis=-1) @ K.T)
+
+    q, v = np.array([[0.2], [-0.4], [0.7]]), np.array([[0.1], [0.0], [-0.3]])
+    for q0, v0 in ((q[0], v[0]), (q, v)):
+        asked.clear()
+        compiled = smooth.integrate(q0, v0, times, LinearFeedback(K), **given)
+        path = smooth.integrate(q0, v0, times, law, **given)
+        assert path.success and path.x.shape == compiled.x.shape and path.u.shape == compiled.u.shape
+        np.testing.assert_allclose(asked, hold * np.arange(10), atol=1e-15)
+        np.testing.assert_allclose(path.x, compiled.x, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(path.u, compiled.u, rtol=0, atol=1e-9)
+        assert np.all(path.evaluations < 1.5 * compiled.evaluations), "steps go on where they were"
+    with pytest.raises(EngineError, match="Give its period, hold"):
+        smooth.integrate(q[0], v[0], times, law, **(given | {"hold": None}))
+
+
+def test_a_function_that_controls_spares_the_other_motions_of_a_batch():
+    smooth = compile_model(of_text(SWING), cache=None)
+    law = lambda t, q, v: np.where(np.arange(2)[:, None] == 1, np.nan, -q)  # noqa: E731
+    times = np.linspace(0.0, 1.0, 11)
+    path = smooth.integrate([[0.3, 0.1], [1.5, 0.1]], [0.0, 0.0], times, law, hold=0.1)
+    alone = smooth.integrate([0.3, 0.1], [0.0, 0.0], times, lambda t, q, v: -q, hold=0.1)
+    assert path.status[0] == 0 and path.status[1] != 0
+    np.testing.assert_allclose(path.x[0], alone.x, atol=1e-12)
+    assert np.isnan(path.x[1, 1:]).all()
 
 
 def test_prescribed_motion_becomes_polynomials_that_agree_to_rounding():
@@ -818,6 +859,14 @@ def test_dry_friction_is_smoothed_over_the_stated_width():
     assert [line for line in smooth.differences if "0.1 rad/s" in line]
     with pytest.raises(EngineError, match="positive"):
         compile_model(model, friction_width=0.0)
+
+
+def test_who_runs_compiled_code_writes_none_of_it():
+    """Its programs are kept on disk under a hash of the folders that write them: no other may."""
+    sim = MJCF.parent.parent / "sim"
+    files = [*(sim / "engines").glob("*.py"), *sim.glob("*.py")]
+    assert len(files) > 20
+    assert [f.name for f in files if re.search(r"from \.+compile|import .*\bTape\b", f.read_text())] == []
 
 
 def test_a_second_use_finds_the_code_and_another_model_does_not(tmp_path):

@@ -7,16 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 import mujoco
 import numpy as np
 
-from ..compile.diff import directional, gradient
-from ..compile.graph import Node, Scalar
+from ..compile.graph import Scalar
 from ..compile.tape import Tape
+from .derivatives import VJPS
 from .forces import disabled, rotation_spring_energy, tendon_stretch
 from .rigid import spatial
 from .rigid.kinematics import body_pose, gravity_energy, kinetic_energy, link_poses, momentum
 from .rigid.tree import BALL, FREE, HINGE, SLIDE, Pose
-from .symbolic import Equations
+from .symbolic import STATE, Equations
 
-STATE = "q v act u tau w p"
 FORMULATIONS = ("composite", "articulated")
 
 
@@ -30,12 +29,8 @@ def _forward(eq: Equations, kind: str) -> Tape:
     return eq.tape(STATE, {"a": eq.acceleration(kind, eq.inputs["tau"])})
 
 
-def _rate_terms(eq: Equations, kind: str) -> list[Scalar]:
-    return [*eq.coordinate_rate(), *eq.acceleration(kind), *eq.actuation[1]]
-
-
 def _rate(eq: Equations, kind: str) -> Tape:
-    return eq.tape("q v act u w p", {"dx": _rate_terms(eq, kind)})
+    return eq.tape("q v act u w p", {"dx": eq.rate(kind)})
 
 
 def _inverse(eq: Equations, kind: str) -> Tape:
@@ -124,129 +119,7 @@ def _sites(eq: Equations, kind: str) -> Tape:
     return eq.tape("q w p", {"p": places, "R": [x for pose in poses for row in pose.R for x in row]})
 
 
-class _Implicit:
-    """Derivatives of the accelerations from those of the equations' residual with the accelerations held.
-
-    r(a_local, s) = 0 gives d a_local = -M^-1 dr; the world sees d(R a_local) = R d a_local + dR a_local.
-    """
-
-    def __init__(self, eq: Equations, kind: str, tau: Sequence[Scalar]):
-        self.eq, self.kind = eq, kind
-        a_local = eq.acceleration_local(kind, tau)
-        self.a = eq.seen(a_local)
-        held = [eq.graph.hold(x) for x in a_local]
-        self.residual, self.seen = eq.residual_local(held, tau), eq.seen(held)
-
-    def along(self, seeds: Sequence[Mapping[Node, Scalar]]) -> list[list[Scalar]]:
-        """Derivatives along `seeds`, one column each."""
-        eq, out = self.eq, []
-        turned = directional(self.seen, seeds)
-        for column, turn in zip(directional(self.residual, seeds), turned, strict=True):
-            solved = eq.free(eq.world(eq.factor.solve([-x for x in column])))
-            out.append(spatial.add(solved, turn))
-        return out
-
-    def weighted(self, bar: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
-        """Rows and weights whose weighted sum has the gradient of bar . a."""
-        eq = self.eq
-        solved = eq.solve_local(eq.local(eq.spread(bar)), self.kind)
-        return [*self.residual, *self.seen], [*(-eq.graph.hold(x) for x in solved), *bar]
-
-
-def _inverse_mass(eq: Equations) -> list[list[Scalar]]:
-    """M^-1 over the state's freedoms; only one triangle is computed."""
-    lay = eq.layout
-    columns = []
-    for k in range(lay.nv):
-        unit = eq.spread([1.0 if i == k else 0.0 for i in range(lay.nv)])
-        columns.append(eq.free(eq.world(eq.factor.solve(eq.local(unit)))))
-    return [[columns[max(i, j)][min(i, j)] for j in range(lay.nv)] for i in range(lay.nv)]
-
-
-def _rows(columns: list[list[Scalar]], height: int) -> list[Scalar]:
-    """Row-major matrix of `columns`."""
-    return [column[i] for i in range(height) for column in columns]
-
-
-def _derivatives(eq: Equations, kind: str) -> Tape:
-    """Of the accelerations by q (tangent), v and tau."""
-    lay = eq.layout
-    implicit = _Implicit(eq, "composite", eq.inputs["tau"])  # whose factor the columns need anyway
-    by_q = implicit.along([eq.tangent(k) for k in range(lay.nv)])
-    by_v = implicit.along([{x: 1.0} for x in eq.inputs["v"]])
-    outputs = {"a": implicit.a, "dq": _rows(by_q, lay.nv), "dv": _rows(by_v, lay.nv)}
-    return eq.tape(STATE, outputs | {"dtau": [x for row in _inverse_mass(eq) for x in row]})
-
-
-def _control_derivatives(eq: Equations, kind: str) -> Tape:
-    """Of the accelerations by activations, controls and parameters."""
-    lay = eq.layout
-    implicit = _Implicit(eq, "composite", eq.inputs["tau"])
-    outputs = {}
-    for name in ("act", "u", "p"):
-        columns = implicit.along([{x: 1.0} for x in eq.inputs[name]])
-        outputs["d" + name] = _rows(columns, lay.nv)
-    return eq.tape(STATE, outputs)
-
-
-def _rate_jacobian(eq: Equations, kind: str) -> Tape:
-    """Of dx/dt by x (plain coordinates, quaternions included), u and p."""
-    zero: list[Scalar] = [0.0] * eq.layout.nv
-    implicit = _Implicit(eq, "composite", zero)
-    outputs = {"rate": _rate_terms(eq, "composite")}
-    kinematic, activation = eq.coordinate_rate(), eq.actuation[1]
-    for name, keys in (("x", ("q", "v", "act")), ("u", ("u",)), ("p", ("p",))):
-        seeds = [{node: 1.0} for key in keys for node in eq.inputs[key]]
-        q_part, act_part = directional(kinematic, seeds), directional(activation, seeds)
-        columns = [[*q, *a, *s] for q, a, s in zip(q_part, implicit.along(seeds), act_part, strict=True)]
-        outputs["d" + name] = _rows(columns, eq.layout.nx)
-    return eq.tape("q v act u w p", outputs)
-
-
-def _pulled_back(eq: Equations, by_q: Sequence[Scalar]) -> list[Scalar]:
-    """Gradient by q in the tangent space."""
-    place = {node: k for k, node in enumerate(eq.inputs["q"])}
-    return [
-        spatial.dot(list(seed.values()), [by_q[place[node]] for node in seed])
-        for seed in (eq.tangent(k) for k in range(eq.layout.nv))
-    ]
-
-
-def _vjp(eq: Equations, kind: str) -> Tape:
-    """bar . d(accelerations): by q (tangent), v, act, u, tau and p."""
-    bar = eq.inputs["bar"][: eq.layout.nv]
-    rows, weights = _Implicit(eq, kind, eq.inputs["tau"]).weighted(bar)
-    names = ("q", "v", "act", "u", "tau", "p")
-    by = _gradients(eq, rows, weights, names)
-    return eq.tape(STATE + " bar", {"q": _pulled_back(eq, by["q"])} | {n: by[n] for n in names[1:]})
-
-
-def _rate_vjp(eq: Equations, kind: str) -> Tape:
-    """bar . d(dx/dt): by x (plain coordinates), u and p."""
-    lay, bar = eq.layout, eq.inputs["bar"]
-    zero: list[Scalar] = [0.0] * lay.nv
-    rows, weights = _Implicit(eq, kind, zero).weighted(bar[lay.nq : lay.nq + lay.nv])
-    rows = [*eq.coordinate_rate(), *rows, *eq.actuation[1]]
-    by = _gradients(
-        eq, rows, [*bar[: lay.nq], *weights, *bar[lay.nq + lay.nv : lay.nx]], ("q", "v", "act", "u", "p")
-    )
-    outputs = {"x": by["q"] + by["v"] + by["act"], "u": by["u"], "p": by["p"]}
-    return eq.tape("q v act u w p bar", outputs, bar="x")
-
-
-def _gradients(
-    eq: Equations, rows: Sequence[Scalar], weights: Sequence[Scalar], names: Sequence[str]
-) -> dict[str, list[Scalar]]:
-    flat = gradient(rows, weights, [node for name in names for node in eq.inputs[name]])
-    out, at = {}, 0
-    for name in names:
-        size = len(eq.inputs[name])
-        out[name] = flat[at : at + size]
-        at += size
-    return out
-
-
-FUNCTIONS: dict[str, Callable[[Equations, str], Tape]] = {
+FUNCTIONS: Mapping[str, Callable[[Equations, str], Tape]] = {
     "forward": _forward,
     "rate": _rate,
     "inverse": _inverse,
@@ -258,9 +131,5 @@ FUNCTIONS: dict[str, Callable[[Equations, str], Tape]] = {
     "momentum": _momentum,
     "poses": _poses,
     "sites": _sites,
-    "derivatives": _derivatives,
-    "control_derivatives": _control_derivatives,
-    "rate_jacobian": _rate_jacobian,
-    "vjp": _vjp,
-    "rate_vjp": _rate_vjp,
+    **VJPS,
 }

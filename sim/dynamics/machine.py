@@ -14,6 +14,7 @@ from ..compile import jit
 from ..compile.cache import Cache, key_of
 from ..compile.program import Bound, Build, Program, map_source, obtain, workers
 from ..errors import EngineError, unknown
+from .derivatives import JACOBIANS
 from .fields import Parameter, parameter_index
 from .fingerprint import code_fingerprint, model_fingerprint
 from .functions import FUNCTIONS, cheaper_formulation
@@ -111,17 +112,23 @@ class Machine:
         """The cheaper formulation of the forward dynamics."""
         return cheaper_formulation(self.equations)
 
-    def tape(self, name: str) -> Any:
-        """The program of one of FUNCTIONS before compilation (`.casadi()` gives it to optimisers)."""
+    def tape(self, name: str, *, columns: int = 1) -> Any:
+        """The program of one of FUNCTIONS or JACOBIANS before compilation; `.casadi()` is for optimisers.
+
+        Up to `columns` of a Jacobian's columns are computed side by side.
+        """
+        if name in JACOBIANS:
+            return JACOBIANS[name](self.equations, columns)
         return FUNCTIONS[name](self.equations, self.formulation)
 
     def program(self, name: str, lanes: int) -> Program:
-        """The compiled function `name` of FUNCTIONS in `lanes`."""
+        """The compiled function `name` of FUNCTIONS or JACOBIANS in `lanes`."""
         found = self._programs.get((name, lanes))
         if found is None:
 
             def make() -> tuple[str, str, dict[str, Any]]:
-                kernels, loops, facts = map_source(self.tape(name), lanes)
+                columns = jit.preferred_lanes() if lanes == 1 else 1  # for more states the lanes are theirs
+                kernels, loops, facts = map_source(self.tape(name, columns=columns), lanes)
                 return kernels, loops, facts | {"formulation": self.formulation}
 
             code = obtain(name, lanes, self.cache, key_of(self.key, "map", name, str(lanes)), make)

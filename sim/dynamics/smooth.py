@@ -235,11 +235,12 @@ class Smooth(Machine):
         """Integrate from t_eval[0] to t_eval[-1] with steps that follow the tolerances, compiled whole.
 
         The states at `t_eval` [s] (ascending) come from the method's continuous extension. `controls` as for
-        `rollout`, held over `hold` seconds (None: the whole span), without functions. `w` prescribes the
-        keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), which is taken over as polynomials;
-        no step crosses its `breaks` [s], where it or a derivative jumps (found where they are not given), and
-        prescribed velocities that jump pull the others along. A batch shares them. Raises EngineError for
-        shapes that do not fit and for a method without an error estimate.
+        `rollout`, held over `hold` seconds (None: the whole span; a function needs a number). `w` prescribes
+        the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), which is taken over as
+        polynomials; no step crosses its `breaks` [s], where it or a derivative jumps (found where they are
+        not given), and prescribed velocities that jump pull the others along. A batch shares them. Events of
+        one's own are found by `sim.integrate.solve(smooth.problem(u), ..., events=...)`. Raises EngineError
+        for shapes that do not fit and for a method without an error estimate.
         """
         times = np.ascontiguousarray(t_eval, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2 or not (times[1:] > times[:-1]).all():

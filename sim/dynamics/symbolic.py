@@ -23,6 +23,8 @@ from .rigid.newton_euler import generalized_forces
 from .rigid.tree import BALL, FREE, Link, build_tree
 from .support import unsupported
 
+STATE = "q v act u tau w p"
+
 
 class Equations:
     """Expressions of one model under given roles.
@@ -213,6 +215,10 @@ class Equations:
             else:
                 out.append(v[dof])
         return out
+
+    def rate(self, formulation: str) -> list[Scalar]:
+        """d(q, v, act)/dt."""
+        return [*self.coordinate_rate(), *self.acceleration(formulation), *self.actuation[1]]
 
     def inverse(self, a: Sequence[Scalar]) -> list[Scalar]:
         """Forces on all freedoms, beside passive ones, that produce `a` (state) and the prescribed motion."""

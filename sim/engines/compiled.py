@@ -12,7 +12,7 @@ from .limits import Limit, Limits, slack
 from .timed import Timed
 
 if TYPE_CHECKING:
-    from ..dynamics.motion.loops import Guards
+    from ..dynamics.motion.guards import Guards
     from ..dynamics.motion.prescribed import Pieces
     from ..integrate import Tableau
 
@@ -110,34 +110,12 @@ class Compiled:
 
     def guards(self, limits: Limits) -> Guards | None:
         """What steps of any length must not pass unseen: limits of free joints, the pull of those at rest."""
-        from ..dynamics.motion.loops import Guards
+        from ..dynamics.motion.guards import Bound, Guards, Rest
 
-        free = self._free(limits)
-        gaps = [(limit, self.q_free == limit.qpos, self.v_free == limit.dof) for limit in free]
-        count = len(gaps) + len(self.resting)
-        if not count:
-            return None
-
-        def tape() -> Tape:
-            eq = self.smooth.equations
-            q, v, offsets = eq.inputs["q"], eq.inputs["v"], eq.graph.inputs("offsets", count)
-            places = [(limit, int(np.argmax(at_q)), int(np.argmax(at_v))) for limit, at_q, at_v in gaps]
-            values = [limit.side * (limit.bound - q[i]) for limit, i, _ in places]
-            rates = [-limit.side * v[j] for limit, _, j in places]
-            forces = drive_forces(eq, self.smooth.formulation)
-            values += [
-                -limit.side * forces[int(np.argmax(self.v_keyed == limit.dof))] for limit in self.resting
-            ]
-            rates += [0.0] * len(self.resting)
-            given = {name: len(eq.inputs[name]) for name in ("q", "v", "act", "u", "w", "p")}
-            values = [x + more for x, more in zip(values, offsets, strict=True)]
-            return Tape.build(given | {"offsets": count}, {"values": values, "rates": rates})
-
-        from ..compile.tape import Tape
-        from ..dynamics.functions import drive_forces
-
-        sides = [(limit.joint, limit.bound, limit.side) for limit in (*free, *self.resting)]
-        return Guards(repr((sides, len(self.resting))), count, len(self.resting), tape)
+        q, v, keyed = (at.tolist().index for at in (self.q_free, self.v_free, self.v_keyed))
+        bounds = [Bound(q(at.qpos), v(at.dof), at.bound, at.side) for at in self._free(limits)]
+        rests = [Rest(keyed(at.dof), at.side) for at in self.resting]
+        return Guards(tuple(bounds), tuple(rests)) if bounds or rests else None
 
     def guard_offsets(self, held: Held, limits: Limits) -> Array:
         """What is added to the guards under held inputs: a controller's forces on joints at rest."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +18,11 @@ from ...errors import EngineError
 from ...integrate.tableau import Tableau
 from ..laws import LinearFeedback
 from ..layout import Layout
-from .loops import Guards, Loop, compiled_loop, finish
+from .guards import Guards
+from .loops import Loop, compiled_loop, finish
 from .path import STATUS, Path
 from .prescribed import Pieces, constant, ends, pieces_of
-from .rows import NO_MOTION, NOTHING, Controls, Prescribed, Start, control_rows, parameter_rows
+from .rows import NO_MOTION, NOTHING, Controls, Prescribed, PythonLaw, Start, control_rows, parameter_rows
 
 if TYPE_CHECKING:
     from ..smooth import Smooth
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _KINDS = "qqqPPddPdPPPqqPqPPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
+_NEXT = STATISTICS.index("next_step")
 _ONE_SPAN = np.array([[0, 0, 0, -1]])
 JUMP = 1e-9
 """A prescribed velocity that changes by less than this part of itself does not jump."""
@@ -142,33 +145,62 @@ def adaptive(
     max_steps: int,
 ) -> Path:
     """See `Smooth.integrate`."""
+    t0, t1 = float(t_eval[0]), float(t_eval[-1])
+    still = w is None and not smooth.layout.nw
+    spans = smooth.no_motion if still else Spans(smooth.layout, motion_of(smooth, w, t0, t1, breaks))
+    periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
+    h = np.full(len(start.x), first_step or min(t1 - t0, hold or math.inf) * 1e-3)
+    if callable(controls) and not isinstance(controls, LinearFeedback):
+        return _called_back(
+            smooth, start, t_eval, spans, h, controls, hold, periods,
+            method=method, rtol=rtol, atol=atol, p=p, max_steps=max_steps,
+        )  # fmt: skip
+    return _compiled(
+        smooth, start, t_eval, spans, h, controls, hold, periods, method, rtol, atol, p, max_steps
+    )
+
+
+def _compiled(
+    smooth: Smooth,
+    start: Start,
+    t_eval: Array,
+    spans: Spans,
+    h: Array,
+    controls: Controls,
+    hold: float | None,
+    periods: int,
+    method: Tableau,
+    rtol: float,
+    atol: float | Array,
+    p: ArrayLike | None,
+    max_steps: int,
+    *,
+    goes_on: bool = False,
+) -> Path:
+    """All periods in one call; steps begin with `h` (count,), where one that `goes_on` finds the next."""
     nx, nu, count = smooth.layout.nx, smooth.layout.nu, len(start.x)
     t0, t1 = float(t_eval[0]), float(t_eval[-1])
-    periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
     law, rows, gains = control_rows(smooth, controls, periods, count)
     parameters = parameter_rows(smooth, p, count)
     lanes = 1 if count == 1 else smooth.lanes
     loop = adaptive_loop(smooth, lanes, law, method)
-    still = w is None and not smooth.layout.nw
-    spans = smooth.no_motion if still else Spans(smooth.layout, motion_of(smooth, w, t0, t1, breaks))
     edges, of_span = spans.between(t0, t1, hold, periods)
     motion, tolerance = spans.motion, np.full(nx, atol, dtype=float)
     path = np.full((count, len(t_eval), nx), np.nan)
     last, stats = np.empty_like(start.x), np.zeros((count, len(STATISTICS)))
-    h0 = np.full(count, first_step or min(t1 - t0, hold or math.inf) * 1e-3)
     applied = np.empty((count, periods, nu)) if law is not None else NOTHING.array
     shared = [
         address(a)
         for a in (edges, of_span, tolerance, motion.knots, motion.coefficients, spans.jumps, t_eval)
     ]
-    own = [address(a) for a in (start.x, h0, path, last, stats, applied)]
+    own = [address(a) for a in (start.x, h, path, last, stats, applied)]
 
     def call(first: int, size: int) -> None:
         at_edges, at_spans, at_tolerance, at_knots, at_coefficients, at_jumps, at_times = shared
         strides = (nx, 1, len(t_eval) * nx, nx, len(STATISTICS), periods * nu)
-        x0, h, out, x1, facts, u = (at + 8 * first * stride for at, stride in zip(own, strides, strict=True))
+        x0, h0, out, x1, facts, u = (at + 8 * first * stride for at, stride in zip(own, strides, strict=True))
         loop.run(
-            size, periods, len(edges), at_edges, at_spans, t0, rtol, at_tolerance, float(max_steps), x0, h,
+            size, periods, len(edges), at_edges, at_spans, t0, rtol, at_tolerance, float(max_steps), x0, h0,
             rows.at(first), rows.per_state, rows.per_row, gains.at(first), gains.per_state, u,
             parameters.at(first), parameters.per_state, at_knots, at_coefficients, motion.terms, at_jumps, 0,
             at_times, len(t_eval), 0, out, x1, facts,
@@ -179,9 +211,50 @@ def adaptive(
     seconds = time.perf_counter() - begin
     shown = applied if law is not None else rows.shown(count)
     _, rejected, evaluations, status = stats.astype(np.int64).T[:4]
+    if goes_on:
+        h[:] = stats[:, _NEXT]
     times = t_eval.view()
     times.flags.writeable = False
     return finish(smooth, start, times, path, shown, evaluations, seconds, rejected=rejected, status=status)
+
+
+def _called_back(
+    smooth: Smooth,
+    start: Start,
+    t_eval: Array,
+    spans: Spans,
+    h: Array,
+    controls: PythonLaw,
+    hold: float | None,
+    periods: int,
+    **rest: Any,
+) -> Path:
+    """With a Python function as the controller, called at the start of every period."""
+    if hold is None:
+        raise EngineError("how often is the function that controls called? Give its period, hold [s]")
+    lay, x, count = smooth.layout, start.x, len(start.x)
+    ends = np.append(t_eval[0] + hold * np.arange(periods), t_eval[-1])
+    path, applied = np.full((count, len(t_eval), lay.nx), np.nan), np.full((count, periods, lay.nu), np.nan)
+    status, evaluations, rejected = np.zeros((3, count), np.int64)
+    seconds = 0.0
+    for k, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
+        q, v = x[:, : lay.nq], x[:, lay.nq : lay.nq + lay.nv]
+        applied[:, k] = controls(begin, q[0], v[0]) if start.single else controls(begin, q, v)
+        inside = (t_eval >= begin) & ((t_eval < end) | (k == periods - 1))
+        times = np.unique(np.concatenate([[begin], t_eval[inside], [end]]))
+        part = _compiled(
+            smooth, Start(x, False), times, spans, h, applied[:, k : k + 1], None, 1, goes_on=True, **rest
+        )
+        path[:, inside] = part.x[:, np.isin(times, t_eval[inside])]
+        evaluations, rejected = evaluations + part.evaluations, rejected + part.rejected
+        status = np.where(status == 0, part.status, status)
+        seconds += part.seconds
+        x = np.ascontiguousarray(part.x[:, -1])
+        if status.all():
+            break
+    shown = t_eval.view()
+    shown.flags.writeable = False
+    return finish(smooth, start, shown, path, applied, evaluations, seconds, rejected=rejected, status=status)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from ...compile.llvm import declarations
 from ...compile.loops import declare
 from ...compile.program import Code, facts_of, obtain
 from ...compile.rollout import Shape, live_stages
-from ...compile.tape import Tape
 from ...integrate.tableau import Tableau
 from ..laws import LinearFeedback
+from .guards import Guards
 from .path import STATUS, Path
 from .rows import Start
 
@@ -31,23 +30,6 @@ Array = NDArray[np.float64]
 _NONE = np.zeros(1, np.int64)
 PARALLEL_OPERATIONS = 400_000
 """Work below which one thread is quicker."""
-
-
-@dataclass(frozen=True)
-class Guards:
-    """Functions that an integration must not pass zero of.
-
-    Attributes:
-        key: what the functions are, for the compiled code's key.
-        count: how many.
-        rateless: how many of them, the last ones, have no rate.
-        tape: makes the program (q, v, act, u, w, p, offsets) -> values and their rates.
-    """
-
-    key: str
-    count: int
-    rateless: int
-    tape: Callable[[], Tape]
 
 
 class Loop:
@@ -113,8 +95,8 @@ def compiled_loop(
         if law is not None:
             parts["law"] = law.tape(smooth.layout)
         if guards is not None:
-            parts["guard"] = guards.tape()
-            options.update(guards=guards.count, rateless=guards.rateless)
+            parts["guard"] = guards.tape(smooth)
+            options.update(guards=guards.count, rateless=len(guards.rests))
         kernels = loops = declarations(lanes) + "\n"
         for part, tape in parts.items():
             kernels += kernel(part, tape, lanes)

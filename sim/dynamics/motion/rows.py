@@ -108,8 +108,7 @@ def control_rows(
         gains = controls.gains()
         rows = rows_of("references", references, references.shape[-1], periods, count)
         return controls, rows, per_state("K", gains, gains.shape[-1], count)
-    if callable(controls):
-        raise EngineError("a Python function as the controller works with rollout only")
+    assert not callable(controls)
     return None, rows_of("controls", controls, lay.nu, periods, count), NOTHING
 
 
