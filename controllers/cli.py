@@ -20,7 +20,10 @@ SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked 
 def control(
     scene: SceneFile,
     compare: Annotated[
-        str, typer.Option(help="Laws, separated by commas: pid,computed-torque,lqr,mpc.")
+        str,
+        typer.Option(
+            help="Laws, separated by commas: pid,computed-torque,lqr,mpc; ilc: the scene's law, learning."
+        ),
     ] = "",
     sweep: Annotated[
         list[str] | None, typer.Option(help="Values of a parameter: frequency=2,5,10, or one: site=tip.")
@@ -39,13 +42,15 @@ def control(
     from ..sim.compose import LAWS
     from ..sim.scene.load import load_scene
     from . import experiments, tables
+    from .trial import ILC
 
     tables.check_format(table)
     loaded = load_scene(scene)
     own = loaded.controller.law if loaded.controller else "pd"
     laws = [law.strip() for law in compare.split(",") if law.strip()] or [own]
-    if unknown := [law for law in laws if law not in LAWS]:
-        raise PantographError(f"no law {unknown[0]!r}; there is: {', '.join(sorted(LAWS))}")
+    known = sorted((*LAWS, ILC))
+    if unknown := [law for law in laws if law not in known]:
+        raise PantographError(f"no law {unknown[0]!r}; there is: {', '.join(known)}")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"controlling {scene.stem}", total=None)
@@ -65,9 +70,18 @@ def control(
         console.print(line, soft_wrap=True)
     for what, rows in (("control", tables.summary(result)), ("runs", tables.runs(result))):
         console.print(f"table: {tables.save(rows, out / f'{scene.stem}.{what}.{table}')}", soft_wrap=True)
-    picture = out / f"{scene.stem}.control.png"
-    experiments.figure(result).savefig(picture, dpi=120)
-    console.print(f"picture: {picture}", soft_wrap=True)
+    pictures = {"control": experiments.figure(result)}
+    for name, trial in result.trials.items():
+        if trial.learned is not None:
+            errors = ", ".join(f"{error:.2e}" for error in trial.learned.errors)
+            console.print(f"{name}, RMS error of each repeat: {errors}", soft_wrap=True, highlight=False)
+            kept = trial.learned.save(out / f"{scene.stem}.{name.replace(' ', '-')}.npz")
+            console.print(f"learned forces: {kept} (the controller's word 'learned')", soft_wrap=True)
+            pictures["learning"] = experiments.learning(result)
+    for name, picture in pictures.items():
+        path = out / f"{scene.stem}.{name}.png"
+        picture.savefig(path, dpi=120)
+        console.print(f"picture: {path}", soft_wrap=True)
 
 
 def _values(text: str) -> tuple[str, list[Any]]:
@@ -92,8 +106,8 @@ def _tables(result: Any) -> tuple[Table, Table]:
     count = len(result.disturbances)
     well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
     well.title = f"tracked joints: errors (rad, m), settling (s); worst of {count} disturbed runs"
-    cost = _columns("law", "effort", "work J", "saturated", "tick us", "99 % us", "of period")
-    cost.title = f"what it takes; period {result.period * 1e3:g} ms"
+    cost = _columns("law", "effort", "work J", "saturated", "build ms", "tick us", "99 % us", "of period")
+    cost.title = f"what it takes; ticks after the first build, period {result.period * 1e3:g} ms"
     for row in result.rows:
         f, name = row.nominal, row.variant.name
         settled = (
@@ -108,6 +122,7 @@ def _tables(result: Any) -> tuple[Table, Table]:
             f"{f.effort:.4g}",
             f"{f.work:.4g}",
             f"{f.saturated:.1%}",
+            f"{f.build * 1e3:.3g}",
             f"{f.tick * 1e6:.0f}",
             f"{f.tick99 * 1e6:.0f}",
             f"{f.tick99 / result.period:.1%}",

@@ -23,7 +23,7 @@ from ..sim.scene.schema import Scene
 from .gains import force_limits
 from .nominal import Nominal
 from .reality import LOOP_WORDS
-from .trial import Disturbance, Figures, Trial, run_trial
+from .trial import ILC, ILC_WORDS, Disturbance, Figures, Trial, run_trial
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,9 +89,10 @@ def compare(
     the scene. ``sweep`` gives lists of parameter values: for every law, each combination of those that it
     has is a variant. The scene's own
     controller parameters go to its own law, to the others those that say what to do (a goal, a site) and
-    those of sensors and drives. Undisturbed runs are timed
-    one after the other, those of a sweep and disturbed ones share the processors.
-    Raises SceneError for laws and parameters that do not fit.
+    those of sensors and drives. The law "ilc" is the scene's own, or ``of``, after ``repeats`` runs from
+    which it learned: on each machine anew, before it is pushed. Undisturbed runs are timed one after the
+    other, those of a sweep and disturbed ones share the processors. Raises SceneError for laws and parameters
+    that do not fit.
     """
     plan = _plan(scene)
     variants = _variants(scene, laws, sweep or {})
@@ -157,6 +158,25 @@ def figure(comparison: Comparison) -> Figure:
     return chart
 
 
+def learning(comparison: Comparison) -> Figure:
+    """RMS error of every repeat from which laws of the comparison learned."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    chart = Figure(figsize=(8, 4), layout="constrained")
+    ax = chart.subplots()
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for name, trial in comparison.trials.items():
+        if trial.learned is not None:
+            errors = trial.learned.errors
+            ax.semilogy(range(1, len(errors) + 1), errors, "o-", label=name)
+    ax.set_xlabel("repeat")
+    ax.set_ylabel("RMS error [rad, m]")
+    ax.legend(fontsize=8)
+    ax.grid(alpha=0.3, which="both")
+    return chart
+
+
 def _plan(scene: Scene) -> Plan:
     plan = make_plan(scene)
     if plan.period is None:
@@ -167,21 +187,46 @@ def _plan(scene: Scene) -> Plan:
 
 
 def _variants(scene: Scene, laws: Sequence[str], sweep: Mapping[str, Sequence[Any]]) -> list[Variant]:
-    own = scene.controller.parameters if scene.controller else {}
     out: list[Variant] = []
     for word in sweep:
-        if not any(word in known_words(law) for law in laws):
-            check_law(laws[0], {word: None})
+        if not any(word in _words_of(law, _base(scene)) for law in laws):
+            _check(laws[0], _base(scene), {word: None})
     for law in laws:
-        told = {w: own[w] for w in own if w in LOOP_WORDS or (w in _TASK_WORDS and w in known_words(law))}
-        base = own if scene.controller and law == scene.controller.law else told
-        known = {word: values for word, values in sweep.items() if word in known_words(law)}
+        words = _told(scene, _base(scene) if law == ILC else law) | (
+            {"of": _base(scene)} if law == ILC else {}
+        )
+        known = {word: values for word, values in sweep.items() if word in _words_of(law, _base(scene))}
         for values in product(*known.values()):
             chosen = dict(zip(known, values, strict=True))
             label = " ".join([law, *(f"{k}={v}" for k, v in chosen.items())])
-            check_law(law, dict(base) | chosen)
-            out.append(Variant(law, dict(base) | chosen, label))
+            _check(law, _base(scene), words | chosen)
+            out.append(Variant(law, words | chosen, label))
     return out
+
+
+def _base(scene: Scene) -> str:
+    """The law that learns."""
+    return scene.controller.law if scene.controller else "pd"
+
+
+def _told(scene: Scene, law: str) -> dict[str, Any]:
+    """What the scene tells a law: all if it is its own, else what to do and what sensors and drives are."""
+    own = scene.controller.parameters if scene.controller else {}
+    if scene.controller and law == scene.controller.law:
+        return own
+    return {w: own[w] for w in own if w in LOOP_WORDS or (w in _TASK_WORDS and w in known_words(law))}
+
+
+def _words_of(law: str, base: str) -> tuple[str, ...]:
+    return (*ILC_WORDS, *known_words(base)) if law == ILC else known_words(law)
+
+
+def _check(law: str, base: str, words: Mapping[str, Any]) -> None:
+    """Raise SceneError for words that a law, or the one that learns, does not know."""
+    if law != ILC:
+        check_law(law, dict(words))
+        return
+    check_law(str(words.get("of", base)), {w: x for w, x in words.items() if w not in ILC_WORDS})
 
 
 def _disturbances(plan: Plan, trials: int, mass: float, push: float, seed: int) -> list[Disturbance]:

@@ -14,6 +14,7 @@ from ..sim.control import Law, Target
 from ..sim.errors import PantographError
 from ..sim.kinds import SCALAR
 from .gains import Gain, choice, felt_inertia, force_limits, limit_per_joint, per_joint, positive
+from .ilc import Fed, load_learned
 from .nominal import difference
 from .observers import Kalman, Observer, VelocityFilter
 from .play import Play, Rotors
@@ -49,6 +50,7 @@ class Loop:
     - ``top_speed`` [rad/s, m/s]: motor force falls linearly to zero at this joint speed;
     - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
       :class:`~pantograph.controllers.play.Play`;
+    - ``learned``: file of forces that :mod:`~pantograph.controllers.ilc` has learned, added to the law's;
     - ``friction`` [N m, N]: dry friction that drives lose, smoothed below ``stiction`` [rad/s, m/s], or below
       the speed that it stops within a period.
 
@@ -74,9 +76,11 @@ class Loop:
         play: Gain = 0.0,
         friction: Gain = 0.0,
         stiction: float = 0.02,
+        learned: str = "",
     ) -> None:
         choice("observer", observer, OBSERVERS, "a loop")
-        self.law, self.model = law, model
+        self.law: Law = law
+        self.model = model
         self.counts = positive("encoder", encoder, zero=True)
         self.backlash = per_joint(model, "backlash", backlash)
         self.late = int(np.ceil(positive("delay", delay, zero=True) / period - 1e-9))
@@ -89,6 +93,8 @@ class Loop:
         stopped = self.friction * period / felt_inertia(model, q0)
         self.stiction = np.maximum(positive("stiction", stiction), stopped)
         self.play = Play(model, np.where(tracked, per_joint(model, "play", play), 0.0), period)
+        if learned:
+            self.law = Fed(law, load_learned(learned, model.nv, period), period)
         self.observer = _observer(observer, model, q0, positive("corner", corner), self.counts)
 
     def _needs_limits(self, word: str, dofs: NDArray[np.bool_]) -> None:
@@ -148,7 +154,7 @@ class Loop:
 
 LOOP_WORDS = (
     "encoder", "backlash", "observer", "corner", "delay", "saturation", "top_speed", "play", "friction",
-    "stiction",
+    "stiction", "learned",
 )  # fmt: skip
 
 

@@ -18,10 +18,13 @@ from ..sim.engines.common import Broken
 from ..sim.engines.interface import Controls, Held, Problem, Role
 from ..sim.plan import Plan
 from .gains import force_limits
+from .ilc import Fed, Learned, learn
 from .nominal import difference
-from .reality import LoopMemory
+from .reality import LOOP_WORDS, LoopMemory, with_reality
 
 Array = NDArray[np.float64]
+ILC = "ilc"  # no law of its own: another one that learns
+ILC_WORDS = ("of", "repeats", "share", "bandwidth")
 _BAND = 0.02  # of its motion: a joint that stays this near to its last key has settled
 
 
@@ -69,12 +72,14 @@ class Figures:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Figures of a run, with its samples: t (n,) [s], error (n, nv), tau (n, nv)."""
+    """Figures of a run, with its samples: t (n,) [s], error (n, nv), tau (n, nv); and what was ``learned``
+    in repeats before it, if anything was."""
 
     figures: Figures
     t: Array
     error: Array
     tau: Array
+    learned: Learned | None = None
 
 
 class _Sample(NamedTuple):
@@ -123,21 +128,22 @@ class _Pushed:
 def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Disturbance) -> Trial:
     """Run a plan under the law ``law`` with parameters ``words``; the law believes the undisturbed model.
 
-    Raises SceneError for a law or parameter that does not fit, and PantographError when the scene has nothing
-    to control. A run that breaks is measured until then; one that breaks at its first sample raises
-    EngineError.
+    The law "ilc" first learns on the disturbed machine, without its push. Raises SceneError for a law or
+    parameter that does not fit, and PantographError when the scene has nothing to control. A run that breaks
+    is measured until then; one that breaks at its first sample raises EngineError.
     """
     problem, period = plan.problem, plan.period
     assert period is not None
-    begun = time.perf_counter()
-    made = make_law(law, problem, dict(words), period)
+    begun, learned = time.perf_counter(), None
+    true = _disturbed(problem, disturbance)
+    if law == ILC:
+        learned, made = _learned(plan, true, words, period)
+    else:
+        made = make_law(law, problem, dict(words), period)
     q, v, _ = problem.state0
-    made(
-        0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start()
-    )  # laws build what they need when called
+    made(0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start())  # builds what the law needs
     build = time.perf_counter() - begun
     watched = _Watched(made, force_limits(problem.model))
-    true = _disturbed(problem, disturbance)
     controls = _Pushed(Sampled(watched, true, period), disturbance)
     try:
         segment = make_engine(plan.engine.what).run(true, (0.0, true.steps * true.step), controls)
@@ -145,7 +151,27 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
         if not watched.seen:
             raise
         segment = broken.segment
-    return _measured(problem, watched.seen, build, segment.status, segment.message)
+    trial = _measured(problem, watched.seen, build, segment.status, segment.message)
+    return replace(trial, learned=learned)
+
+
+def _learned(plan: Plan, true: Problem, words: Mapping[str, Any], period: float) -> tuple[Learned, Law]:
+    """What the law ``of`` of these words learns on the ``true`` machine, and that law with it."""
+    how = {word: words[word] for word in ILC_WORDS if word in words}
+    base, problem = how.pop("of", "pd"), plan.problem
+    own = {word: x for word, x in words.items() if word not in ILC_WORDS and word not in LOOP_WORDS}
+    real = {word: x for word, x in words.items() if word in LOOP_WORDS}
+    tracked = problem.dofs(Role.TRACKED)
+
+    def around(law: Law) -> Law:
+        return with_reality(law, problem.model, tracked, problem.state0.q, period, real)
+
+    def law() -> Law:
+        return make_law(base, problem, own, period)
+
+    engine, delay = make_engine(plan.engine.what), real.get("delay", 0.0)
+    learned = learn(law, true, engine, period, around=around, delay=delay, **how)
+    return learned, around(Fed(law(), learned.forces, period))
 
 
 def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:

@@ -4,12 +4,14 @@ import csv
 import dataclasses
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pantograph.controllers import tables
 from pantograph.controllers import trial as trials
-from pantograph.controllers.experiments import Row, Variant, _disturbances, compare, figure
+from pantograph.controllers.cli import control
+from pantograph.controllers.experiments import Row, Variant, _disturbances, compare, figure, learning
 from pantograph.controllers.gains import force_limits
 from pantograph.controllers.nominal import Nominal
 from pantograph.controllers.trial import Disturbance, _disturbed, run_trial
@@ -327,3 +329,55 @@ def test_a_scene_without_anything_to_control_is_refused():
         compare(scene, ["pd"])
     with pytest.raises(PantographError, match="no parameter 'frequenzy'"):
         compare(Scene(**PENDULUM), ["pd"], sweep={"frequenzy": [1.0]})
+
+
+def test_a_law_that_learns_stands_beside_others(tmp_path):
+    """On the machine that was modelled, and on heavier ones that it learns anew before they are pushed."""
+    own = {"law": "pd", "period": 0.002, "frequency": 3.0, "delay": 0.004}
+    scene = Scene(**PENDULUM | {"controller": own})
+    result = compare(scene, ["pd", "ilc"], sweep={"repeats": [5]}, trials=1, push=0.0, processes=1)
+    pd, ilc = result.rows
+    assert ilc.variant.words == {"frequency": 3.0, "delay": 0.004, "of": "pd", "repeats": 5}
+    assert ilc.nominal.rms < 0.5 * pd.nominal.rms
+    assert ilc.disturbed[0].rms < 0.5 * pd.disturbed[0].rms
+    learned = result.trials["ilc repeats=5"].learned
+    assert len(learned.errors) == 5
+    assert learned.errors[0] == pytest.approx(pd.nominal.rms, rel=1e-9)
+    assert ilc.nominal.rms == pytest.approx(min(learned.errors), rel=1e-9)
+    line = learning(result).axes[0].lines[0]
+    np.testing.assert_array_equal(line.get_ydata(), learned.errors)
+    with pytest.raises(PantographError, match="no parameter 'repaets'"):
+        compare(scene, ["ilc"], sweep={"repaets": [1]})
+
+
+def test_the_command_prints_and_saves_all_of_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.toml").write_text(
+        """duration = 0.4
+[[models]]
+file = "planar_2r"
+[roles]
+tracked = ["shoulder", "elbow"]
+[actuators]
+"*" = "off"
+[[keys]]
+joint = "shoulder"
+times = [0, 0.2]
+values = [0, 0.3]
+curve = "clamped"
+"""
+    )
+    control(Path("arm.toml"), compare="pd,ilc", sweep=["repeats=3"], trials=1, processes=1, out=Path("o"))
+    said = capsys.readouterr().out
+    assert "RMS error of each repeat" in said
+    assert "build ms" in said
+    made = [
+        "arm.control.csv",
+        "arm.control.png",
+        "arm.ilc-repeats=3.0.npz",
+        "arm.learning.png",
+        "arm.runs.csv",
+    ]
+    assert sorted(p.name for p in Path("o").iterdir()) == made
+    with pytest.raises(PantographError, match="no law 'pdd'; there is: computed-torque, ilc, impedance"):
+        control(Path("arm.toml"), compare="pdd")

@@ -18,11 +18,12 @@ from pantograph.controllers.play import Play, Rotors
 from pantograph.controllers.reality import Loop
 from pantograph.controllers.task import Task
 from pantograph.models import load_model
-from pantograph.sim import Scene, SceneError, make_plan, run
-from pantograph.sim.compose import LAWS, make_law
+from pantograph.sim import PantographError, Scene, SceneError, make_plan, run
+from pantograph.sim.compose import LAWS, make_engine, make_law
 from pantograph.sim.control import Target
 from pantograph.sim.curves import keyed
 from pantograph.sim.engines.contact import ContactEngine
+from pantograph.sim.scene.schema.scene import ControllerItem
 from scipy import linalg
 from strategies import random_states, seeds, trees
 
@@ -431,15 +432,43 @@ def test_learning_removes_what_the_model_does_not_know():
     problem = make_plan(arm_scene("pd", 6, duration=1.5)).problem
     true = dataclasses.replace(problem, model=_heavier(problem.model, 1.1))
     found = learn(
-        lambda: make_law("pd", true, {}, 0.002, model=problem.model),
-        true,
-        ContactEngine(),
-        0.002,
-        trials=8,
-        tracked=np.ones(6, dtype=bool),
+        lambda: make_law("pd", true, {}, 0.002, model=problem.model), true, ContactEngine(), 0.002, repeats=8
     )
     assert found.errors[-1] < 0.05 * found.errors[0]
     assert found.forces.shape == (750, 6)
+
+
+def test_a_repeat_that_diverges_is_the_last_one():
+    problem = make_plan(arm_scene("pd", 6, duration=0.2)).problem
+    wild = {"kp": 1e9, "kd": 1e6}
+    found = learn(lambda: make_law("pd", problem, wild, 0.002), problem, ContactEngine(), 0.002, repeats=8)
+    assert found.errors == (np.inf,)
+    assert not found.forces.any()
+    for words in ({"share": 1.5}, {"repeats": 0}, {"bandwidth": -1.0}):
+        with pytest.raises(PantographError):
+            learn(lambda: make_law("pd", problem, {}, 0.002), problem, ContactEngine(), 0.002, **words)
+
+
+def test_what_was_learned_can_be_given_to_a_scene(tmp_path):
+    """The file that learning wrote makes a run of the same law as good as its best repeat."""
+    scene = arm_scene("pd", 6, duration=0.6).model_copy(update={"rate": 500.0})
+    plan = make_plan(scene)
+    engine = make_engine(plan.engine.what)
+    found = learn(lambda: make_law("pd", plan.problem, {}, 0.002), plan.problem, engine, 0.002, repeats=4)
+    path = found.save(tmp_path / "a" / "arm.npz")
+    item = ControllerItem(law="pd", period=0.002, learned=str(path))
+    recording = run(scene.model_copy(update={"controller": item}))
+    np.testing.assert_allclose(recording.tick_t, recording.t[:-1], atol=1e-9)
+    aims = plan.problem.clip.evaluate(recording.tick_t).q
+    assert np.sqrt(np.mean((recording.q[:-1] - aims) ** 2)) == pytest.approx(min(found.errors), rel=1e-6)
+    assert min(found.errors) < 0.1 * found.errors[0]
+    for words, message in (
+        ({"period": 0.004}, "learned with a period of 0.002 s"),
+        ({"learned": str(tmp_path / "none.npz")}, "cannot read forces"),
+    ):
+        item = ControllerItem(**{"law": "pd", "period": 0.002, "learned": str(path)} | words)
+        with pytest.raises(SceneError, match=message):
+            make_plan(scene.model_copy(update={"controller": item}))
 
 
 @pytest.mark.parametrize(
