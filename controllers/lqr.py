@@ -18,7 +18,7 @@ from ..sim.clip import Clip
 from ..sim.control import Target
 from .design.linear import held_matrices, linearise_path
 from .design.riccati import along, dlqr
-from .gains import Gain, force_weights, per_joint
+from .gains import Gain, force_weights, per_joint, positive
 from .nominal import Nominal, difference
 from .preview import Preview, aimed
 
@@ -45,8 +45,9 @@ class LQR:
     Cost per second: ``position`` |q - q_d|^2 + ``velocity`` |v - v_d|^2 + ``force`` |u - u_d|^2, weights one
     number or one a joint by name. ``force`` defaults to 1 / f^2 with f what the joint's drive can give, or
     its weight at ``q0`` where it can give anything. Joints without keys are kept at ``goal`` (joint ->
-    value), or where they start. The gains are those of forces held over ``period`` [s], and are computed
-    when first used.
+    value), or where they start. With ``final`` [s] regulation ends with the scene, where deviations cost as
+    much as so many seconds of them: gains of a finite horizon, also on keys that rest; without, it goes on
+    for ever. The gains are those of forces held over ``period`` [s], and are computed when first used.
     """
 
     def __init__(
@@ -63,7 +64,9 @@ class LQR:
         velocity: Gain = 1.0,
         force: Gain | None = None,
         goal: Mapping[str, float] | None = None,
+        final: float | None = None,
     ) -> None:
+        self.final = None if final is None else positive("the LQR's final", final, zero=True)
         self.model, self.tracked, self.keyed = model, tracked, keyed
         clip, self.unkeyed = aimed(clip, {} if goal is None else goal, "the LQR's goal")
         self.period, self.preview = period, Preview(clip, period, duration)
@@ -86,10 +89,16 @@ class LQR:
         tau = np.array([self.nominal.inverse(*row) for row in zip(q, v, a, strict=True)])
         continuous = linearise_path(self.nominal, q, v, a, tau, inputs=self.tracked, keyed=self.keyed)
         A, B = held_matrices(*continuous, self.period)
-        last = dlqr(A[-1], B[-1], self.Q, self.R)
-        if rest:
-            return Solution(A, B, last.K[None], np.array([last.P, last.P]), tau[:, self.tracked])
-        return Solution(A, B, *along(A, B, self.Q, self.R, last.P), tau[:, self.tracked])
+        if self.final is None:
+            last = dlqr(A[-1], B[-1], self.Q, self.R)
+            if rest:
+                return Solution(A, B, last.K[None], np.array([last.P, last.P]), tau[:, self.tracked])
+            end = last.P
+        else:
+            end = self.Q * (self.final / self.period)
+            ticks = len(path.q)
+            A, B, tau = (np.broadcast_to(x, (ticks, *x.shape[1:])) for x in (A, B, tau))
+        return Solution(A, B, *along(A, B, self.Q, self.R, end), tau[:, self.tracked])
 
     @cached_property
     def gains(self) -> Array:

@@ -28,7 +28,7 @@ from scipy import linalg
 from strategies import random_states, seeds, trees
 
 ARM = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll"]
-WORDS = {"operational-space": {"site": "tip"}, "impedance": {"site": "tip"}}
+WORDS = {"operational-space": {"site": "tip"}, "impedance": {"site": "tip"}, "nmpc": {"horizon": 0.1}}
 
 
 def arm_scene(law, seed=0, *, duration=1.0, period=0.002, tracked=ARM, **words):
@@ -428,6 +428,44 @@ def test_lqr_holds_an_unstable_state_and_follows_keys():
     assert worst_error(arm_scene("lqr", 5)) < 1e-4
 
 
+@pytest.mark.parametrize("keys", [[0.0], [0.0, 0.4]])
+@pytest.mark.parametrize("final", [0.0, 3.0])
+def test_regulation_that_ends_is_the_minimum_over_all_forces(keys, final):
+    """Forces of the law along its own linearised motion against least squares over the whole horizon, on keys
+    that rest and that move."""
+    scene = Scene(
+        duration=0.4,
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        keys=[{"joint": "slide", "times": np.linspace(0, 0.4, len(keys)).tolist(), "values": keys}],
+        controller={"law": "lqr", "period": 0.02, "final": final, "force": 0.3},
+    )
+    law = make_law("lqr", make_plan(scene).problem, {"final": final, "force": 0.3}, 0.02)
+    A, B, K, P, _ = law.solution
+    assert len(K) == 20
+    x0, Q, R = np.array([0.1, -0.05, 0.2, 0.1]), law.Q, law.R
+    # x = M x0 + N u, minimised by its normal equations
+    M, N = [np.eye(4)], [np.zeros((4, 20))]
+    for k in range(20):
+        push = np.zeros((4, 20))
+        push[:, k] = B[k][:, 0]
+        M.append(A[k] @ M[-1])
+        N.append(A[k] @ N[-1] + push)
+    weights = [Q] * 20 + [np.diag([400.0, 400.0, 1.0, 1.0]) * final]
+    H = R[0, 0] * np.eye(20) + sum(n.T @ W @ n for n, W in zip(N, weights, strict=True))
+    g = sum(n.T @ W @ m for n, m, W in zip(N, M, weights, strict=True)) @ x0
+    u = -np.linalg.solve(H, g)
+    x = x0
+    for k in range(20):
+        np.testing.assert_allclose(-K[k] @ x, u[k : k + 1], rtol=1e-6, atol=1e-9 * np.abs(u).max())
+        x = A[k] @ x + B[k] @ (-K[k] @ x)
+    assert x0 @ P[0] @ x0 == pytest.approx(
+        sum((m @ x0 + n @ u) @ W @ (m @ x0 + n @ u) for m, n, W in zip(M, N, weights, strict=True))
+        + R[0, 0] * u @ u,
+        rel=1e-9,
+    )
+
+
 def test_learning_removes_what_the_model_does_not_know():
     problem = make_plan(arm_scene("pd", 6, duration=1.5)).problem
     true = dataclasses.replace(problem, model=_heavier(problem.model, 1.1))
@@ -481,6 +519,7 @@ def test_what_was_learned_can_be_given_to_a_scene(tmp_path):
         ("impedance", {"site": "top"}, "no site 'top'"),
         ("lqr", {"force": 0.0}, "must cost something"),
         ("lqr", {"goal": {"waist": 0.0}}, "no joint without keys 'waist'"),
+        ("lqr", {"final": -1.0}, "final must be a number >= 0"),
         ("mpc", {"horizon": 0.0}, "horizon must be a positive"),
         ("pd", {"observer": "eyes"}, "no observer 'eyes'"),
         ("pd", {"gravity": "no"}, "gravity must be true or false"),
