@@ -11,6 +11,7 @@ from pantograph.models import ModelError, load_model
 from pantograph.sim import rotations
 from pantograph.sim.ik import (
     ChainSolver,
+    Distance,
     JointValue,
     LookAt,
     Orientation,
@@ -270,3 +271,31 @@ def test_every_row_has_its_own_tolerance():
     assert solve(model, Orientation("tip", tilted, tolerance=(0.2, 1e-6, 1e-6))).solved
     assert not solve(model, Orientation("tip", tilted, tolerance=(1e-6, 0.2, 1e-6))).solved
     assert solve(model, loose).solved
+
+
+def test_what_makes_no_goal_is_told_at_once():
+    for wrong, words in (
+        (lambda: Position(3, [0, 0, 0]), "named by text"),
+        (lambda: Position("tip", "here"), "3 finite numbers"),
+        (lambda: Position("tip", [0, 0, 0], weight="much"), "finite number"),
+        (lambda: Position("tip", [0, 0, 0], weight=0), "positive"),
+        (lambda: Position("tip", [0, 0, 0], tolerance="some"), "positive"),
+        (lambda: Position("tip", [0, 0, 0], tolerance=(1e-6, np.nan, 1)), "positive"),
+        (lambda: JointValue("j0", "up"), "finite number"),
+        (lambda: Distance("tip", "at1", -1), "not negative"),
+        (lambda: Spread(("j0",)), "two joints"),
+        (lambda: Spread(("j0", "j1"), (1, -1)), "positive share"),
+        (lambda: solve(_gantry(), Spread(("j0", "j3"))), "only slides"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            wrong()
+
+
+def test_a_model_without_joints_and_the_world_itself_are_judged():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody><body name="b" pos="0 0 1"><geom size=".1"/></body></worldbody></mujoco>""")
+    assert solve(model, Position("body:b", [0, 0, 1])).solved
+    for goals in ([Position("body:b", [0, 0, 1.5])], [Position("body:world", [0.5, 0, 0])]):
+        verdict = solve(model, goals).verdict
+        assert (verdict.kind, verdict.proved) == ("out of reach", True)
+        assert verdict.position == pytest.approx(0.5)

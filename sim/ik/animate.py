@@ -15,7 +15,7 @@ from ...models.naming import lookup
 from .. import rotations
 from ..errors import ModelError
 from ..kinds import BALL, SCALAR, SLIDE
-from .goals import Goal, Rows, Unit, vector
+from .goals import Goal, Rows, Unit, number, vector
 from .pose import Configurations, Kinematics
 from .space import Space
 
@@ -81,6 +81,12 @@ class Spread(Goal):
     joints: tuple[str, ...]
     shares: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shares = [number(f"a share of {self.label}", x) for x in self.shares]
+        if len(self.joints) < 2 or len(shares) not in (0, len(self.joints)) or min(shares, default=1.0) <= 0:
+            raise ModelError(f"{self.label}: needs two joints or more and a positive share for each")
+
     @property
     def label(self) -> str:
         return self.name or "spread " + " ".join(self.joints)
@@ -90,6 +96,8 @@ class Spread(Goal):
 
     def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         kinds = {int(model.jnt_type[lookup(model, "joint", name)]) for name in self.joints}
+        if len(kinds) > 1 or kinds - {BALL, *SCALAR}:
+            raise ModelError(f"{self.label}: only hinges, only slides or only balls have shares of a whole")
         unit: Unit = "m" if kinds == {SLIDE} else "rad"
         return (unit,) * ((len(self.joints) - 1) * (3 if kinds == {BALL} else 1))
 
@@ -99,13 +107,9 @@ class Spread(Goal):
         return np.isin(model.dof_jntid, ids)
 
     def rows(self, c: Configurations) -> Rows:
-        model, shares = c.model, np.array(self.shares or (1.0,) * len(self.joints), dtype=float)
-        if len(self.joints) < 2 or len(shares) != len(self.joints) or not (shares > 0).all():
-            raise ModelError(f"{self.label}: needs two joints or more and a positive share for each")
-        parts = [_coordinate(model, name, c.q) for name in self.joints]
-        if len({r.shape[1] for r, _ in parts}) > 1:
-            raise ModelError(f"{self.label}: joints of different kinds share nothing")
+        shares = np.array(self.shares or (1.0,) * len(self.joints), dtype=float)
         shares = shares / shares.sum()
+        parts = [_coordinate(c.model, name, c.q) for name in self.joints]
         scaled = [(r / s, J / s) for (r, J), s in zip(parts, shares, strict=True)]
         r = [b[0] - a[0] for a, b in pairwise(scaled)]
         J = [b[1] - a[1] for a, b in pairwise(scaled)]
@@ -121,8 +125,6 @@ def _coordinate(model: mujoco.MjModel, name: str, q: Array) -> tuple[Array, Arra
         phi = rotations.log(q[:, at : at + 4])
         J[:, :, v : v + 3] = rotations.inverse_right_jacobian(phi)
         return phi, J
-    if kind not in SCALAR:
-        raise ModelError(f"joint {name!r} is free: it has no share of a turn")
     J[:, 0, v] = 1.0
     return q[:, at : at + 1] - model.qpos0[at], J
 

@@ -47,10 +47,17 @@ class Goal(ABC):
     tolerance: float | tuple[float, ...] = TOLERANCE
 
     def __post_init__(self) -> None:
-        if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
+        for text in self.frames():
+            if not isinstance(text, str):
+                raise ModelError(f"a frame is named by text, as 'tip' or 'body:hand', not by {text!r:.100}")
+        if self.weight is not None and number(f"weight of goal {self.label!r}", self.weight) <= 0:
             raise ModelError(f"weight of goal {self.label!r} must be positive, or None for a hard goal")
-        if not (np.asarray(self.tolerance, dtype=float) > 0).all():
-            raise ModelError(f"tolerance of goal {self.label!r} must be positive, not {self.tolerance}")
+        try:
+            positive = bool((np.asarray(self.tolerance, dtype=float) > 0).all())
+        except (TypeError, ValueError):
+            positive = False
+        if not positive:
+            raise ModelError(f"tolerance of goal {self.label!r} must be positive, not {self.tolerance!r}")
 
     @property
     def label(self) -> str:
@@ -99,10 +106,20 @@ def _norm(x: Array) -> Array:
 
 def vector(name: str, x: ArrayLike, n: int = 3) -> Array:
     """`x` as n finite floats; ModelError with `name` otherwise."""
-    out = np.array(x, dtype=float)
+    try:
+        out = np.array(x, dtype=float)
+    except (TypeError, ValueError):
+        out = np.full(n, np.nan)
     if out.shape != (n,) or not np.isfinite(out).all():
-        raise ModelError(f"{name} must be {n} finite numbers, not {x!r}")
+        raise ModelError(f"{name} must be {n} finite numbers, not {x!r:.100}")
     return out
+
+
+def number(name: str, x: object) -> float:
+    """`x` as a finite float; ModelError with `name` otherwise."""
+    if not isinstance(x, (int, float, np.integer, np.floating)) or not np.isfinite(x):
+        raise ModelError(f"{name} must be a finite number, not {x!r:.100}")
+    return float(x)
 
 
 def _unit(name: str, x: ArrayLike, n: int = 3) -> Array:
@@ -319,8 +336,8 @@ class Distance(Goal):
         super().__post_init__()
         if not isinstance(self.to, str):
             object.__setattr__(self, "to", vector("to", self.to))
-        if not 0 <= self.distance < np.inf:
-            raise ModelError(f"a distance is finite and not negative, not {self.distance}")
+        if number("a distance", self.distance) < 0:
+            raise ModelError(f"a distance is not negative, as {self.distance} is")
 
     def frames(self) -> tuple[str, ...]:
         return (self.at, self.to) if isinstance(self.to, str) else (self.at,)

@@ -253,7 +253,7 @@ def _allowed(model: mujoco.MjModel, joints: Sequence[str] | None) -> NDArray[np.
     if joints is None:
         return np.ones(model.nv, dtype=bool)
     mask = np.zeros(model.nv, dtype=bool)
-    for name in joints:
+    for name in (joints,) if isinstance(joints, str) else joints:
         if name not in joint_names(model):
             raise ModelError(unknown("joint", name, joint_names(model)))
         mask |= model.dof_jntid == lookup(model, "joint", name)

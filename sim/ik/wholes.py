@@ -13,7 +13,7 @@ from ...models.naming import lookup
 from .. import rotations
 from ..errors import ModelError
 from ..kinds import FREE, SCALAR, SLIDE
-from .goals import Goal, Rows, Unit, vector
+from .goals import Goal, Rows, Unit, number, vector
 from .pose import Configurations, Kinematics
 
 Array = NDArray[np.float64]
@@ -59,8 +59,7 @@ class JointValue(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not np.isfinite(self.value):
-            raise ModelError(f"the value of joint {self.joint!r} must be finite, not {self.value}")
+        number(f"the value of joint {self.joint!r}", self.value)
 
     @property
     def label(self) -> str:

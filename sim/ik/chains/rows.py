@@ -373,18 +373,13 @@ def _shares(goal: Any) -> Array:
 
 
 def expressible(problem: Problem) -> bool:
-    """Whether every goal is of a kind known here and makes sense; a goal of a user's own class is not."""
-    return all(is_known(goal) and _sound(goal) for goal in problem.goals)
+    """Whether every goal is of a kind known here; a goal of a user's own class is not."""
+    return all(is_known(goal) for goal in problem.goals)
 
 
 def is_known(goal: Goal) -> bool:
     """Whether a goal's kind is known here."""
     return type(goal) in _known()
-
-
-def _sound(goal: Any) -> bool:
-    shares = getattr(goal, "shares", ())
-    return not shares or (len(shares) == len(goal.joints) and min(shares) > 0)
 
 
 def aims(problem: Problem) -> Array:
