@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from .graph import (
@@ -22,6 +23,7 @@ from .graph import (
     SIN,
     SQRT,
     SUB,
+    Graph,
     Node,
     Scalar,
     cos,
@@ -97,6 +99,47 @@ def directional(outputs: Sequence[Scalar], seeds: Sequence[Mapping[Node, Scalar]
                 tangent[node.id] = total
         columns.append([tangent.get(x.id, 0.0) if isinstance(x, Node) else 0.0 for x in outputs])
     return columns
+
+
+def grouped(
+    outputs: Sequence[Scalar], seeds: Sequence[Mapping[Node, Scalar]], widest: int
+) -> list[list[int]]:
+    """Neighbouring seeds whose columns are best computed side by side, up to `widest` at once.
+
+    A vector costs what a scalar costs, wherever one of its columns is not zero: of all cuts into neighbours
+    the one with the fewest operations (dynamic programming).
+    """
+    if widest == 1:
+        return [[k] for k in range(len(seeds))]
+    table, touched = _Partials(outputs), dict[int, int]()
+    for k, seed in enumerate(seeds):
+        for node in seed:
+            touched[node.id] = touched.get(node.id, 0) | 1 << k
+    for node in table.order:
+        if node.a is not None:
+            for operand, _ in table[node]:
+                touched[node.id] = touched.get(node.id, 0) | touched.get(operand.id, 0)
+    shapes = Counter(touched.values())
+    best: list[tuple[int, int]] = [(0, 0)]
+    for end in range(1, len(seeds) + 1):
+        options = []
+        for first in range(max(0, end - widest), end):
+            among = (1 << end) - (1 << first)
+            work = sum(times for mask, times in shapes.items() if mask & among)
+            options.append((best[first][0] + work, first))
+        best.append(min(options))
+    groups, end = [], len(seeds)
+    while end:
+        first = best[end][1]
+        groups.append(list(range(first, end)))
+        end = first
+    return groups[::-1]
+
+
+def merged(graph: Graph, seeds: Sequence[Mapping[Node, Scalar]]) -> dict[Node, Scalar]:
+    """Seeds side by side."""
+    nodes = dict.fromkeys(node for seed in seeds for node in seed)
+    return {node: graph.vector([seed.get(node, 0.0) for seed in seeds]) for node in nodes}
 
 
 def gradient(outputs: Sequence[Scalar], adjoints: Sequence[Scalar], inputs: Sequence[Node]) -> list[Scalar]:

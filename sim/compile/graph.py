@@ -13,23 +13,31 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 CONST, INPUT, ADD, SUB, MUL, NEG, INV, SQRT, SIN, COS, MIN, MAX, ABS, LESS, ATAN2, HOLD, ROUND = range(17)
+VECTOR, LANE = 17, 18
 OP_NAMES = (
     *("const", "input", "add", "sub", "mul", "neg", "inv", "sqrt", "sin", "cos"),
     *("min", "max", "abs", "less", "atan2", "hold", "round"),
+    *("vector", "lane"),
 )
 _COMMUTATIVE = frozenset((ADD, MUL, MIN, MAX))
 
 
 class Node:
-    """One value of a graph; `a`, `b` are operands, `value` a constant or an input's (argument, index)."""
+    """One value of a graph, or `lanes` of them side by side.
 
-    __slots__ = ("a", "b", "graph", "id", "op", "value")
+    `a`, `b` are operands, `value` a constant, an input's (argument, index), the nodes in a vector or the
+    number of a lane. A scalar operand of a vector counts for every lane.
+    """
+
+    __slots__ = ("a", "b", "graph", "id", "lanes", "op", "value")
     a: Any
     b: Any
+    lanes: int
     value: Any
 
     def __init__(self, graph: Graph, id: int, op: int, a: Node | None, b: Node | None, value: object):
         self.graph, self.id, self.op, self.a, self.b, self.value = graph, id, op, a, b, value
+        self.lanes = max(1 if a is None else a.lanes, 1 if b is None else b.lanes)
 
     def __add__(self, other: Scalar) -> Scalar:
         if not isinstance(other, Node):
@@ -175,6 +183,31 @@ class Graph:
             return _inner(a)
         return 1.0 / a.value if a.op == CONST else self._new(INV, a)
 
+    def vector(self, values: Sequence[Scalar]) -> Scalar:
+        """Numbers and scalar nodes side by side, in a power of two of lanes; nothing but zeros are a zero."""
+        if not any(isinstance(x, Node) or x != 0.0 for x in values):
+            return 0.0
+        if len(values) == 1:
+            return values[0]
+        padding = (1 << (len(values) - 1).bit_length()) - len(values)
+        nodes = tuple(self.node(x) for x in [*values, *[0.0] * padding])
+        found = self._leaf(VECTOR, nodes)
+        found.lanes = len(nodes)
+        return found
+
+    def lane(self, a: Scalar, lane: int) -> Scalar:
+        """What stands in one lane of a vector; a scalar stands in all."""
+        if not isinstance(a, Node) or a.lanes == 1:
+            return a
+        key = (LANE, a.id, lane)
+        found = self._known.get(key)
+        if found is None:
+            found = Node(self, len(self.nodes), LANE, a, None, lane)
+            found.lanes = 1
+            self.nodes.append(found)
+            self._known[key] = found
+        return found
+
     def hold(self, a: Scalar) -> Scalar:
         """`a` as a value that derivatives do not look behind."""
         return self._new(HOLD, a) if isinstance(a, Node) else a
@@ -267,6 +300,8 @@ def reachable(outputs: Iterable[Scalar]) -> list[Node]:
         if node.id in needed:
             continue
         needed[node.id] = node
+        if node.op == VECTOR:
+            stack += node.value
         if node.a is not None:
             stack.append(node.a)
             if node.b is not None:

@@ -7,7 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, INV, LESS, MAX, MIN, MUL, NEG, ROUND, SIN, SQRT, SUB
+from .graph import (
+    ABS,
+    ADD,
+    ATAN2,
+    CONST,
+    COS,
+    INPUT,
+    INV,
+    LANE,
+    LESS,
+    MAX,
+    MIN,
+    MUL,
+    NEG,
+    ROUND,
+    SIN,
+    SQRT,
+    SUB,
+    VECTOR,
+)
 from .llvm import Emitter
 from .packs import Pack, Source, find_packs
 from .tape import Tape
@@ -73,11 +92,11 @@ class Schedule:
     def needs(self, step: int) -> Iterable[int]:
         """Steps before this one."""
         if step in self.home:
-            rows: Iterable[int | None] = (row for source in self.home[step].sources for row in source.rows)
+            rows: Iterable[int] = (row for source in self.home[step].sources for row in source.rows)
         else:
-            rows = self.tape.rows[step][1:]
+            rows = self.tape.operands(step)
         for row in rows:
-            if row is not None and self.tape.rows[row][0] not in _LEAVES:
+            if self.tape.rows[row][0] not in _LEAVES:
                 yield self.step(row)
 
     def _order(self) -> list[int]:
@@ -134,7 +153,7 @@ class Schedule:
         return slots, words
 
     def _width(self, step: int) -> int:
-        return len(self.home[step].rows) if step in self.home else 1
+        return len(self.home[step].rows) if step in self.home else self.tape.widths[step]
 
 
 class _Writer:
@@ -172,17 +191,42 @@ class _Writer:
         return self.tape.rows[step][0] in (SIN, COS) and step not in self.schedule.home
 
     def _write_row(self, row: int, joints: list[int]) -> None:
-        e = self.e
         op, a, b = self.tape.rows[row]
-        if op in (SIN, COS):
+        width = self.tape.widths[row]
+        e = self.e if width == 1 else self.e.sharing(width)
+        if op == LANE:
+            self.values[row] = self.e.sharing(self.tape.widths[a]).lane(self.value(a), b)
+        elif op == VECTOR:
+            self.values[row] = self._side_by_side(e, a)
+        elif op in (SIN, COS):
             if a not in self.pairs:
                 angles = joints if a in joints else [a]
                 self.pairs.update(zip(angles, e.side_by_side([self._leaf(i) for i in angles]), strict=True))
             self.values[row] = self.pairs[a][op == COS]
         else:
-            self.values[row] = _operation(e, op, self.value(a), None if b is None else self.value(b))
+            self.values[row] = _operation(e, op, *(self._filled(e, x) for x in self.tape.operands(row)))
         if row in self.schedule.slots:
-            e.store(self.values[row], "%work", self.schedule.slots[row])
+            self._keep(e, self.values[row], row)
+
+    def _filled(self, e: Emitter, row: int) -> str:
+        """The register of a row; of a scalar's one that has it in all lanes of `e`."""
+        if self.tape.widths[row] == e.lanes or self.e.lanes == e.lanes:
+            return self.value(row)
+        op, a, _ = self.tape.rows[row]
+        return e.const(a) if op == CONST else e.splat(self.value(row))
+
+    def _side_by_side(self, wide: Emitter, rows: Sequence[int]) -> str:
+        if all(self.tape.rows[row][0] == CONST for row in rows):
+            return wide.consts([self.tape.rows[row][1] for row in rows])
+        return wide.gathered([self.value(row) for row in rows])
+
+    def _keep(self, e: Emitter, x: str, step: int) -> None:
+        at = self.e.element("%work", self.schedule.slots[step])
+        e.do(f"store {e.V} {x}, ptr {at}, align 8")
+
+    def _kept(self, e: Emitter, step: int) -> str:
+        at = self.e.element("%work", self.schedule.slots[step])
+        return e.emit(f"load {e.V}, ptr {at}, align 8")
 
     def _write_pack(self, pack: Pack) -> None:
         wide = self.e.sharing(len(pack.rows))
@@ -198,8 +242,7 @@ class _Writer:
             vector = _operation(wide, pack.op, operands[0], operands[1] if len(operands) > 1 else None)
         self.vectors[pack.rows[0]] = vector
         if pack.rows[0] in self.schedule.slots:
-            at = self.e.element("%work", self.schedule.slots[pack.rows[0]])
-            wide.do(f"store {wide.V} {vector}, ptr {at}, align 8")
+            self._keep(wide, vector, pack.rows[0])
 
     def value(self, row: int) -> str:
         """The register of a row."""
@@ -213,7 +256,8 @@ class _Writer:
             elif row in self.schedule.home:
                 self.values[row] = self._lane(self.schedule.home[row], row)
             else:
-                self.values[row] = e.load("%work", self.schedule.slots[row])
+                width = self.tape.widths[row]
+                self.values[row] = self._kept(e if width == 1 else e.sharing(width), row)
         return self.values[row]
 
     def _lane(self, pack: Pack, row: int) -> str:
@@ -246,8 +290,7 @@ class _Writer:
             if pack.op == INPUT:
                 self.vectors[first] = wide.gathered([self._leaf(row) for row in pack.rows])
             else:
-                at = self.e.element("%work", self.schedule.slots[first])
-                self.vectors[first] = wide.emit(f"load {wide.V}, ptr {at}, align 8")
+                self.vectors[first] = self._kept(wide, first)
         return self.vectors[first]
 
 
@@ -257,7 +300,7 @@ def _signed_sum(wide: Emitter, a: str, b: str, signs: Sequence[int]) -> str:
     return wide.f("fadd", a, wide.f("fmul", b, wide.consts(signs)))
 
 
-def _operation(e: Emitter, op: int, a: str, b: str | None) -> str:
+def _operation(e: Emitter, op: int, a: str, b: str | None = None) -> str:
     if op in _BINARY:
         assert b is not None
         return e.f(_BINARY[op], a, b)

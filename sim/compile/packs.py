@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, LESS, MAX, MIN, MUL, NEG, SQRT, SUB
+from .graph import ABS, ADD, ATAN2, CONST, COS, INPUT, LANE, LESS, MAX, MIN, MUL, NEG, SQRT, SUB, VECTOR
 from .tape import Tape
 
 Rows = tuple[int, ...]  # one row of the tape for each limb
@@ -140,7 +140,11 @@ class _Finder:
         """Pack the rows of one depth whose operands are packed."""
         found: dict[tuple[int, ...], list[list[int]]] = {}
         for row in level:
-            if row in self.taken or self.tape.rows[row][0] == NEG:
+            if (
+                row in self.taken
+                or self.tape.rows[row][0] in (NEG, VECTOR, LANE)
+                or self.tape.widths[row] > 1
+            ):
                 continue
             known = self.key(row)
             if known is not None:
@@ -176,11 +180,9 @@ def find_packs(tape: Tape) -> list[Pack]:
 def _depths(tape: Tape) -> list[int]:
     """Operations before each row, minus signs not counted."""
     out: list[int] = []
-    for op, a, b in tape.rows:
-        if op in (CONST, INPUT):
-            out.append(0)
-        else:
-            out.append(out[a] if op == NEG else 1 + max(out[a], -1 if b is None else out[b]))
+    for row, (op, a, _) in enumerate(tape.rows):
+        beneath = (out[x] for x in tape.operands(row))
+        out.append(out[a] if op == NEG else 1 + max(beneath, default=-1))
     return out
 
 
@@ -188,12 +190,14 @@ def _shapes(tape: Tape) -> list[int]:
     """A number for each row: equal where the same is computed up to constants and signs."""
     known: dict[tuple[int, ...], int] = {}
     out: list[int] = []
-    for op, a, b in tape.rows:
+    for row, (op, a, b) in enumerate(tape.rows):
         if op == NEG:
             out.append(out[a])
             continue
-        if op == CONST:
-            key: tuple[int, ...] = (op,)
+        if op in (VECTOR, LANE):
+            key: tuple[int, ...] = (op, row)
+        elif op == CONST:
+            key = (op,)
         elif op == INPUT:
             key = (op, a, b)
         else:

@@ -19,6 +19,7 @@ from .graph import (
     HOLD,
     INPUT,
     INV,
+    LANE,
     LESS,
     MAX,
     MIN,
@@ -29,6 +30,7 @@ from .graph import (
     SIN,
     SQRT,
     SUB,
+    VECTOR,
     Node,
     Scalar,
     reachable,
@@ -55,6 +57,8 @@ _NUMPY = {
 @dataclass(frozen=True)
 class Tape:
     """Program of (op, a, b) rows; a, b are rows, or a constant, or an input's (argument, index).
+
+    A vector's a are the rows side by side, a lane's b is its number.
 
     `inputs` and `outputs` give the size of every argument by name, in the order of the compiled call;
     `results` gives for every output the rows of its scalars. `limbs` are sets of limbs built alike, each limb
@@ -90,6 +94,10 @@ class Tape:
             elif node.op == INPUT:
                 name, index = node.value
                 rows.append((INPUT, argument[name], index))
+            elif node.op == VECTOR:
+                rows.append((VECTOR, tuple(place[x.id] for x in node.value), None))
+            elif node.op == LANE:
+                rows.append((LANE, place[node.a.id], node.value))
             else:
                 rows.append((node.op, place[node.a.id], None if node.b is None else place[node.b.id]))
         constants: dict[float, int] = {}
@@ -109,6 +117,26 @@ class Tape:
             for each in limbs
         )
         return Tape(tuple(rows), dict(inputs), sizes, results, alike)
+
+    def operands(self, row: int) -> tuple[int, ...]:
+        """Rows that a row is computed from."""
+        op, a, b = self.rows[row]
+        if op in _FREE:
+            return ()
+        if op == VECTOR:
+            return tuple(a)
+        return (a,) if b is None or op == LANE else (a, b)
+
+    @cached_property
+    def widths(self) -> tuple[int, ...]:
+        """Values that stand side by side in each row."""
+        out: list[int] = []
+        for row, (op, a, _) in enumerate(self.rows):
+            if op == VECTOR:
+                out.append(len(a))
+            else:
+                out.append(1 if op == LANE else max((out[x] for x in self.operands(row)), default=1))
+        return tuple(out)
 
     @cached_property
     def counts(self) -> dict[str, int]:
@@ -134,17 +162,22 @@ class Tape:
         """The outputs by NumPy, broadcasting over leading axes: slow, for checks."""
         lead = np.broadcast_shapes(*(np.shape(x)[:-1] for x in arguments))
         values: list[Any] = []
-        for op, a, b in self.rows:
+        for row, (op, a, b) in enumerate(self.rows):
             if op == CONST:
                 values.append(a)
             elif op == INPUT:
                 values.append(np.asarray(arguments[a])[..., b])
-            elif op == LESS:
-                values.append(np.where(np.less(values[a], values[b]), 1.0, 0.0))
-            elif b is None:
-                values.append(_NUMPY[op](values[a]))
+            elif op == VECTOR:
+                values.append(np.stack([np.broadcast_to(values[i], lead) for i in a], axis=-1))
+            elif op == LANE:
+                values.append(values[a][..., b])
             else:
-                values.append(_NUMPY[op](values[a], values[b]))
+                wide = self.widths[row] > 1
+                terms = [
+                    np.asarray(values[i])[..., None] if wide and self.widths[i] == 1 else values[i]
+                    for i in self.operands(row)
+                ]
+                values.append(np.where(np.less(*terms), 1.0, 0.0) if op == LESS else _NUMPY[op](*terms))
         return [
             np.stack([np.broadcast_to(values[i], lead) for i in rows], axis=-1)
             if rows
@@ -173,6 +206,10 @@ class Tape:
                 values.append(ca.SX(a))
             elif op == INPUT:
                 values.append(arguments[a][b])
+            elif op == VECTOR:
+                values.append(ca.vertcat(*[values[i] for i in a]))
+            elif op == LANE:
+                values.append(values[a][b])
             else:
                 values.append(unary[op](values[a]) if b is None else binary[op](values[a], values[b]))
         outs = [ca.vertcat(*[values[i] for i in rows]) if rows else ca.SX(0, 1) for rows in self.results]
