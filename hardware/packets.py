@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0: a packet is a frozen value with encode and decode; a parser makes packets of bytes.
+"""Dynamixel Protocol 2.0: a packet is a frozen value with encode and decode.
 
 Source: https://emanual.robotis.com/docs/en/dxl/protocol2/ and https://emanual.robotis.com/docs/en/dxl/crc/.
 """
@@ -16,9 +16,9 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
 MAX_ID = 252
 ALERT = 0x80  # bit 7 of a status error: see the register hardware_error_status
-MAX_LENGTH = 2048  # greatest LEN the parser believes; longer than any frame on a bus of 253 servos of 4 bytes
+MARK = b"\xff\xff\xfd"  # what a header begins with; in a body, an extra FD follows it
 
-_STUFFED, _MARK = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
+_STUFFED = MARK + b"\xfd"
 
 
 class Instruction(IntEnum):
@@ -82,17 +82,17 @@ def crc16(data: bytes, crc: int = 0) -> int:
 
 def stuff(body: bytes) -> bytes:
     """Instruction and params as they go on the wire: FF FF FD gets another FD."""
-    return body.replace(_MARK, _STUFFED)
+    return body.replace(MARK, _STUFFED)
 
 
 def unstuff(body: bytes) -> bytes:
     """Inverse of `stuff`."""
-    return body.replace(_STUFFED, _MARK)
+    return body.replace(_STUFFED, MARK)
 
 
 def is_stuffed(body: bytes) -> bool:
     """Whether every FF FF FD in a body is followed by the extra FD."""
-    return body.count(_MARK) == body.count(_STUFFED)
+    return body.count(MARK) == body.count(_STUFFED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,139 +156,6 @@ class Packet:
     def data(self) -> bytes:
         """Params of a status packet after the error byte; of an instruction, all of them."""
         return self.params[1:] if self.is_status else self.params
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """Bytes that are no packet: noise between packets, or a frame that broke a rule."""
-
-    kind: Literal["noise", "header", "crc", "stuffing", "truncated"]
-    data: bytes
-
-
-class Parser:
-    """Incremental parser: bytes in, packets and faults out, independent of how the bytes are cut into chunks.
-
-    It never raises and never waits for a frame that cannot come: a frame that breaks a rule gives up one
-        byte and the rest is scanned again, so that a packet inside a broken frame is found as soon as its
-        last byte is there.
-
-    Args:
-        lenient: Accept frames whose body is not stuffed, as the official SDK sends them; strict drops them,
-            as the protocol says.
-    """
-
-    NOISE_PIECE = 256  # bytes of noise reported in one fault at most
-
-    def __init__(self, *, lenient: bool = False) -> None:
-        self.lenient = lenient
-        self._buffer = bytearray()
-        self._noise = bytearray()
-
-    @property
-    def pending(self) -> int:
-        """Bytes held back because they may begin a packet."""
-        return len(self._buffer)
-
-    def feed(self, data: bytes) -> list[Packet | Fault]:
-        """Packets and faults that these bytes complete, in order."""
-        self._buffer += data
-        return self._scan(at_end=False)
-
-    def flush(self) -> list[Packet | Fault]:
-        """What is left when no more bytes come: a waiting frame is given up, held-back bytes become noise."""
-        out = self._scan(at_end=True)
-        if self._noise:
-            out.append(Fault("noise", bytes(self._noise)))
-            self._noise.clear()
-        return out
-
-    def _scan(self, *, at_end: bool) -> list[Packet | Fault]:
-        out: list[Packet | Fault] = []
-        buffer = self._buffer
-        while buffer:
-            start = buffer.find(HEADER)
-            if start < 0:
-                self._drop(len(buffer) - (0 if at_end else _header_prefix(buffer)), out)
-                break
-            self._drop(start, out)
-            verdict = self._frame(at_end)
-            if verdict is None:
-                break
-            if self._noise:
-                out.append(Fault("noise", bytes(self._noise)))
-                self._noise.clear()
-            out.append(verdict)
-            if isinstance(verdict, Fault):
-                self._drop(1, out)
-            else:
-                del buffer[: 7 + (buffer[5] | buffer[6] << 8)]
-        return out
-
-    def _frame(self, at_end: bool) -> Packet | Fault | None:
-        """Judge the frame at the head of the buffer; None while it is incomplete."""
-        buffer = self._buffer
-        available = len(buffer)
-        if available < 7:
-            return Fault("truncated", bytes(buffer)) if at_end else None
-        length = buffer[5] | buffer[6] << 8
-        if buffer[4] in (0xFD, 0xFF) or not 3 <= length <= MAX_LENGTH:
-            return Fault("header", bytes(buffer[:7]))
-        end = 7 + length
-        fast = buffer[4] == BROADCAST and available > 7 and buffer[7] == Instruction.STATUS
-        if self.lenient or fast:
-            if (inner := self._inner_end(end)) is not None:
-                return Fault("truncated", bytes(buffer[:inner]))
-        elif (mark := self._unstuffed(end)) is not None:
-            return Fault("stuffing", bytes(buffer[: mark + 4]))
-        if available < end:
-            return Fault("truncated", bytes(buffer)) if at_end else None
-        frame = bytes(buffer[:end])
-        if crc16(frame[:-2]) != frame[-2] | frame[-1] << 8:
-            return Fault("crc", frame)
-        return Packet.decode(frame, lenient=True)
-
-    def _unstuffed(self, end: int) -> int | None:
-        """Place of the first FF FF FD in the body, not followed by FD: there another packet begins."""
-        buffer = self._buffer
-        place = 7
-        while (place := buffer.find(_MARK, place, end - 2)) >= 0:
-            if place + 3 >= len(buffer):
-                return None
-            if buffer[place + 3] != 0xFD:
-                return place
-            place += 4
-        return None
-
-    def _inner_end(self, end: int) -> int | None:
-        """Where the first whole packet inside the waiting frame ends, if it ends before the frame does."""
-        buffer = self._buffer
-        first: int | None = None
-        place = 4
-        while (place := buffer.find(HEADER, place, end)) >= 0:
-            if place + 10 <= len(buffer):
-                length = buffer[place + 5] | buffer[place + 6] << 8
-                inner = place + 7 + length
-                whole = 3 <= length <= MAX_LENGTH and inner <= min(len(buffer), end - 1)
-                if whole and (first is None or inner < first):
-                    frame = bytes(buffer[place:inner])
-                    if crc16(frame[:-2]) == frame[-2] | frame[-1] << 8:
-                        first = inner
-            place += 1
-        return first
-
-    def _drop(self, count: int, out: list[Packet | Fault]) -> None:
-        """Move bytes to the noise, reporting full pieces so that memory stays bounded."""
-        self._noise += self._buffer[:count]
-        del self._buffer[:count]
-        while len(self._noise) >= self.NOISE_PIECE:
-            out.append(Fault("noise", bytes(self._noise[: self.NOISE_PIECE])))
-            del self._noise[: self.NOISE_PIECE]
-
-
-def _header_prefix(buffer: bytearray) -> int:
-    """How many last bytes could begin a header."""
-    return next((n for n in (3, 2, 1) if buffer.endswith(HEADER[:n])), 0)
 
 
 # The instructions, as packets. Addresses and lengths are two bytes, little endian.
@@ -368,12 +235,13 @@ def bulk_read(wanted: Iterable[tuple[int, int, int]], *, fast: bool = False) -> 
     return Packet(BROADCAST, instruction, b"".join(bytes((s,)) + _words(a, n) for s, a, n in wanted))
 
 
-def fast_reply(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
+def fast_reply(blocks: Sequence[tuple[int, int, bytes]], length: int | None = None) -> bytes:
     """Bytes on the wire of a fast read reply with (error, servo, data) of each.
 
-    One frame of the broadcast ID: LEN = 1 + sum(4 + n_i); after each block a CRC over everything so far.
+    One frame of the broadcast ID: LEN = 1 + sum(4 + n_i); after each block a CRC over everything so far. A
+    reply that breaks off has a greater LEN than its blocks: ``length``.
     """
-    length = 1 + sum(4 + len(data) for _, _, data in blocks)
+    length = fast_length(len(data) for _, _, data in blocks) if length is None else length
     frame = HEADER + bytes((BROADCAST,)) + _words(length) + bytes((Instruction.STATUS,))
     for error, servo, data in blocks:
         frame += bytes((error, servo)) + data
@@ -381,19 +249,30 @@ def fast_reply(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
     return frame
 
 
-def fast_blocks(reply: Packet, lengths: Sequence[int]) -> list[tuple[int, int, bytes]]:
-    """(error, servo, data) of each block in a fast read reply; PacketError when the lengths do not add up.
+def fast_length(lengths: Iterable[int]) -> int:
+    """LEN of a fast read reply with so many bytes of data from each servo."""
+    return 1 + sum(4 + n for n in lengths)
 
-    Inner CRCs were covered by the CRC of the frame and are skipped.
+
+def fast_blocks(frame: bytes, lengths: Sequence[int], *, whole: bool = False) -> list[tuple[int, int, bytes]]:
+    """(error, servo, data) of the blocks of a fast read reply, up to the first that is cut off or broken.
+
+    ``lengths`` are the bytes of data asked of each servo. Each block's CRC covers everything before it; those
+    inside a ``whole`` frame, whose own CRC holds, are not looked at.
     """
-    total = sum(4 + n for n in lengths) - 2  # the last CRC is the frame's
-    if not reply.is_fast_reply or len(reply.params) != total:
-        raise PacketError(
-            f"a fast read of {list(lengths)} bytes answers {total} bytes, got {len(reply.params)}"
-        )
-    blocks, place = [], 0
+    blocks: list[tuple[int, int, bytes]] = []
+    if len(frame) < 8 or frame[4] != BROADCAST or frame[7] != Instruction.STATUS:
+        return blocks
+    crc, done, place = 0, 0, 8
     for n in lengths:
-        block = reply.params[place : place + 2 + n]
-        blocks.append((block[0], block[1], block[2:]))
-        place += 4 + n
+        end = place + 2 + n
+        if end + 2 > len(frame):
+            break
+        if not whole:
+            crc = crc16(frame[done:end], crc)
+            if crc != frame[end] | frame[end + 1] << 8:
+                break
+            crc, done = crc16(frame[end : end + 2], crc), end + 2
+        blocks.append((frame[place], frame[place + 1], frame[place + 2 : end]))
+        place = end + 2
     return blocks

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.hardware import service
-from pantograph.hardware.driver import Driver, NoAnswer, Refused, _sdk_stuffs
+from pantograph.hardware.driver import Driver, NoAnswer, Refused
 from pantograph.hardware.errors import BusError, HardwareError, RegisterError
-from pantograph.hardware.packets import Packet, Parser
+from pantograph.hardware.link import _sdk_stuffs
+from pantograph.hardware.packets import Packet
 from pantograph.hardware.ports import SerialPort, latency_of, open_port
 from pantograph.hardware.virtual import (
     NO_FAULTS,
@@ -25,6 +26,7 @@ from pantograph.hardware.virtual import (
     WireFault,
     serve,
 )
+from pantograph.hardware.virtual.parser import Parser
 
 BAUD = 1_000_000
 POSITION = ["present_position"]

@@ -1,10 +1,12 @@
 """Protocol 2.0: vectors of the manual, round trips, and a parser that nothing stops."""
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pantograph.hardware import packets as p
-from pantograph.hardware.packets import Fault, Packet, PacketError, Parser
+from pantograph.hardware.packets import Packet, PacketError
+from pantograph.hardware.virtual.parser import Fault, Parser
 
 # e-manual, Protocol 2.0: every example of the page that states both packets.
 MANUAL = [
@@ -120,9 +122,31 @@ def test_fast_replies_are_one_frame_with_running_crcs(blocks):
         end += 4 + n
         assert crc_bit_by_bit(frame[: end - 2]) == frame[end - 2] | frame[end - 1] << 8
     (packet,) = (e for e in Parser().feed(frame) if isinstance(e, Packet))
-    assert p.fast_blocks(packet, lengths) == blocks
-    with pytest.raises(PacketError):
-        p.fast_blocks(packet, [*lengths, 1])
+    assert packet.is_fast_reply
+    assert p.fast_blocks(frame, lengths) == p.fast_blocks(frame, lengths, whole=True) == blocks
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 255), st.integers(0, 252), blobs), min_size=1, max_size=6),
+    st.integers(0, 10**6),
+    st.integers(1, 255),
+)
+def test_of_a_broken_fast_reply_the_blocks_before_the_break_count(blocks, place, flip):
+    """Cut short, or with a byte changed: what comes before is read, what comes after is not believed."""
+    frame, lengths = p.fast_reply(blocks), [len(data) for _, _, data in blocks]
+    place %= len(frame)
+    ends = np.cumsum([4 + n for n in lengths]) + 8
+    before = blocks[: int(np.searchsorted(ends, place, "right"))]
+    assert p.fast_blocks(frame[:place], lengths) == before
+    changed = bytearray(frame)
+    changed[place] ^= flip
+    assert p.fast_blocks(bytes(changed), lengths) == before
+
+
+def test_a_fast_reply_that_breaks_off_still_tells_its_whole_length():
+    frame = p.fast_reply([(0, 1, b"\1\2")], p.fast_length([2, 2]))
+    assert frame[5] | frame[6] << 8 == 1 + 2 * 6
+    assert p.fast_blocks(frame, [2, 2]) == [(0, 1, b"\1\2")]
 
 
 stream = st.lists(

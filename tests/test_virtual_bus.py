@@ -44,6 +44,7 @@ from pantograph.hardware.virtual import (
     WireFault,
     serve,
 )
+from pantograph.hardware.virtual.parser import Parser
 from serial import Serial, SerialException
 
 TORQUE, LED, GOAL, PRESENT = 64, 65, 116, 132
@@ -341,7 +342,7 @@ def replies(bus: VirtualBus, packet: p.Packet, baud: int = 1_000_000) -> list[p.
     """Everything that comes back within a second of virtual time."""
     bus.send(packet.encode(), baud)
     bus.advance(1.0)
-    return [e for e in p.Parser().feed(bus.receive()) if isinstance(e, p.Packet)]
+    return [e for e in Parser().feed(bus.receive()) if isinstance(e, p.Packet)]
 
 
 def test_replies_come_in_the_order_of_the_request():
@@ -350,7 +351,7 @@ def test_replies_come_in_the_order_of_the_request():
     assert [r.id for r in replies(bus, p.bulk_read([(5, 7, 1), (2, 7, 1)]))] == [5, 2]
     assert [r.id for r in replies(bus, p.ping())] == [1, 2, 3, 4, 5]
     (fast,) = replies(bus, p.sync_read(7, 1, [4, 1, 3], fast=True))
-    assert p.fast_blocks(fast, [1, 1, 1]) == [(0, 4, b"\4"), (0, 1, b"\1"), (0, 3, b"\3")]
+    assert p.fast_blocks(fast.encode(), [1, 1, 1]) == [(0, 4, b"\4"), (0, 1, b"\1"), (0, 3, b"\3")]
     assert replies(bus, p.write(p.BROADCAST, LED, b"\1")) == []
     assert all(s.get("led") == 1 for s in bus.servos)
 

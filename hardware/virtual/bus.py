@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from ..errors import HardwareError
-from ..packets import BROADCAST, HEADER, MAX_LENGTH, Instruction, Packet, Parser, crc16, status
+from ..packets import BROADCAST, Instruction, Packet, fast_length, fast_reply, status
 from .drive import PERIOD
 from .faults import NO_FAULTS, FaultDice, FaultPlan, Upset
+from .parser import MAX_LENGTH, Parser
 from .servo import ENCODER, OVERHEATING, OVERLOAD, SHOCK, VOLTAGE, VirtualServo
 
 BITS_PER_BYTE = 10  # 8 data bits, a start bit and a stop bit
@@ -258,20 +259,18 @@ class VirtualBus:
     def _fast(self, hearing: list[VirtualServo], packet: Packet, now: float, baud: int) -> float:
         """The common frame of a fast read; it breaks off at the first servo that is missing or too old."""
         requests = list(wanted(packet))
-        length = 1 + sum(4 + n for _, _, n in requests)
-        if length > MAX_LENGTH:
-            return now
-        frame = HEADER + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((Instruction.STATUS,))
-        first: VirtualServo | None = None
+        length = fast_length(size for _, _, size in requests)
+        blocks: list[tuple[int, int, bytes]] = []
         for id, address, size in requests:
             servo = _find(hearing, id)
-            link = servo.reply_to_read(address, size) if servo and servo.reads_fast else None
-            if servo is None or link is None:
+            read = servo.reply_to_read(address, size) if servo and servo.reads_fast else None
+            if read is None:
                 break
-            first = first or servo
-            frame += bytes((link[0], id)) + link[1].ljust(size, b"\0")
-            frame += crc16(frame).to_bytes(2, "little")
-        return self._reply(frame, first, now, baud) if first else now
+            blocks.append((read[0], id, read[1].ljust(size, b"\0")))
+        first = _find(hearing, requests[0][0]) if blocks else None
+        if first is None or length > MAX_LENGTH:
+            return now
+        return self._reply(fast_reply(blocks, length), first, now, baud)
 
     def _reply(self, frame: bytes, servo: VirtualServo, now: float, baud: int) -> float:
         """Put a reply on the wire; when its last byte has passed."""

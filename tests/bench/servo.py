@@ -12,6 +12,7 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler
 from figures import Figure, at_most, main
 from pantograph.hardware import packets as p
 from pantograph.hardware.virtual import MemoryPort, Timing, VirtualBus, VirtualServo
+from pantograph.hardware.virtual.parser import Parser
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -142,7 +143,7 @@ def fuzz_parser(console: Console) -> list[Figure]:
     figures = []
     for lenient in (False, True):
         random = Random(20260101)
-        parser = p.Parser(lenient=lenient)
+        parser = Parser(lenient=lenient)
         raised = missed = eaten = probes = fed = 0
         start = time.perf_counter()
         for data in track([*pieces(random, FUZZ_BYTES)], f"parser, lenient={lenient}", console=console):
@@ -197,7 +198,7 @@ def fuzz_bus(console: Console) -> list[Figure]:
         bus.send(p.ping(servo.id).encode(), servo.baud)
         bus.advance(0.1)
         same = sum(s.id == servo.id and s.baud == servo.baud for s in servos)
-        answers = [e for e in p.Parser().feed(bus.receive()) if isinstance(e, p.Packet)]
+        answers = [e for e in Parser().feed(bus.receive()) if isinstance(e, p.Packet)]
         silent += same == 1 and [a.id for a in answers] != [servo.id]
     return [
         Figure("fuzz, bus: bytes", sent, "bytes", ">= 1e6", sent >= FUZZ_BYTES),
