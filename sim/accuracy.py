@@ -53,7 +53,11 @@ def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: f
 def _estimate_adaptive(
     engine: Engine, problem: Problem, segment: Segment, replay: Replay | None
 ) -> ErrorEstimate:
-    """Difference to a run at a hundredth of the tolerance, whose own error is small beside it."""
+    """Difference to a run at a hundredth of the tolerance, whose own error is small beside it.
+
+    No order is assumed, and limits are located to rounding in both runs: it is trusted to the end
+    (``trusted_until`` is infinite), also where the two meet other limits, which it shows as a large error.
+    """
     assert problem.tolerance is not None
     if problem.tolerance < _TIGHTEST:
         raise EngineError(

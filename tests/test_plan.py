@@ -1,4 +1,5 @@
 import itertools
+import re
 from dataclasses import replace
 
 import mujoco
@@ -10,6 +11,7 @@ from pantograph.sim import Scene, SceneError, make_plan, run
 from pantograph.sim.engines.interface import Drive, Role
 from pantograph.sim.engines.smooth import width_of
 from pantograph.sim.engines.touch import can_touch
+from pantograph.sim.gain import gain_without_contacts
 from pantograph.sim.needs import Needs
 
 PENDULUM = {"models": [{"file": "pendulum"}]}
@@ -298,6 +300,26 @@ def test_what_would_be_cheaper_is_told_where_it_would():
     assert cheaper(props=[BALL]) == ""
     assert cheaper(props=[BALL, FLOOR], physics={"contacts": "none"}) == ""
     assert "2 times less" in cheaper(**PENDULUM, solver={"step": 0.001, "engine": "contact"})
+
+
+def test_what_contacts_cost_is_measured_where_there_are_some():
+    said = gain_without_contacts(plan_of(models=[{"file": "quadruped"}], duration=0.4))
+    found = re.fullmatch(
+        r'physics\.contacts = "none" takes ([\d.]+) times less time a simulated second: ([\d.]+) ms with the '
+        r"smooth engine instead of ([\d.e+]+) ms \(measured over the first ([\d.]+) s\)",
+        said,
+    )
+    times, less, cost, span = (float(x) for x in found.groups())
+    assert times == pytest.approx(cost / less, rel=0.05) and span <= 0.4
+    for none in (
+        plan_of(**PENDULUM, **KEYED),
+        plan_of(models=[{"file": "quadruped"}], physics={"contacts": "none"}),
+        plan_of(models=[{"file": "quadruped"}], physics={"contacts": "none"}, solver={"engine": "contact"}),
+    ):
+        assert gain_without_contacts(none) is None
+    # where the scene asks for the contact engine, its own gain is what is measured
+    tied = plan_of(models=[{"file": "quadruped"}], solver={"engine": "contact"}, duration=0.1)
+    assert "contact engine" in gain_without_contacts(tied) or "nothing" in gain_without_contacts(tied)
 
 
 def test_joints_tied_to_keyed_ones_follow_them(tmp_path):

@@ -117,9 +117,13 @@ def run(
 @app.command(epilog="Example: pantograph plan wave.toml")
 def plan(scene: SceneFile) -> None:
     """Explain how a scene will be computed, what is left out, and what would be cheaper."""
+    from ..gain import gain_without_contacts
     from ..plan import make_plan
 
-    show.plan(console, make_plan(scene))
+    made = make_plan(scene)
+    with show.status("measuring what contacts cost"):
+        gain = gain_without_contacts(made)
+    show.plan(console, made, gain)
 
 
 @app.command(epilog="Example: pantograph film out/wave.npz wave.gif --camera side")

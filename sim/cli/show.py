@@ -103,8 +103,8 @@ def notes(console: Console, recording: Recording) -> None:
         console.print(f"[yellow]note:[/] and {len(recording.notes) - 8} more in the recording's notes")
 
 
-def plan(console: Console, plan: Plan) -> None:
-    """The plan with its reasons."""
+def plan(console: Console, plan: Plan, measured: str | None = None) -> None:
+    """The plan with its reasons, and what was ``measured`` for it."""
     table = Table(title=plan.setup.scene.title or None, show_header=False)
     table.add_column(no_wrap=True)
     table.add_row("engine", f"{plan.engine.what}: {plan.engine.why}")
@@ -132,6 +132,8 @@ def plan(console: Console, plan: Plan) -> None:
         table.add_row("left out", escape(line))
     for line in plan.cheaper:
         table.add_row("cheaper", escape(line))
+    if measured:
+        table.add_row("measured", escape(measured))
     console.print(table)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import time
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -97,7 +96,6 @@ class Loaded:
     """Machine code in memory; lives as long as this object or a function taken from it."""
 
     engine: Any
-    seconds: float
 
     def function(self, name: str, *argtypes: Any) -> Any:
         """A function of the module as a ctypes callable that releases the interpreter lock."""
@@ -110,9 +108,8 @@ def load(code: bytes) -> Loaded:
     """Object code ready to run."""
     import llvmlite.binding as llvm
 
-    begin = time.perf_counter()
     _initialize()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine(1))
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    return Loaded(engine, time.perf_counter() - begin)
+    return Loaded(engine)

@@ -99,4 +99,3 @@ class Layout:
         self.w_timed = len(self.q_keyed) + 2 * len(self.v_keyed)
         self.w_wrenches = self.w_timed + len(timed)
         self.nw = self.w_wrenches + 6 * len(wrenches)
-        self.nv_model = int(model.nv)

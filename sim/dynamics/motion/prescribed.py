@@ -47,11 +47,6 @@ class Pieces:
     coefficients: Array
     breaks: NDArray[np.intp]
 
-    @property
-    def times_of_breaks(self) -> Array:
-        """The breaks [s]."""
-        return np.asarray(self.knots[self.breaks])
-
     def __call__(self, t: ArrayLike, *, left: bool = False) -> Array:
         """Values (n, width) at times `t` (n,); where they jump, from the right or from the `left`."""
         times = np.asarray(t, dtype=float)
