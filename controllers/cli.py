@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -155,11 +156,11 @@ def _columns(*heads: str) -> Table:
 def gains(
     scene: SceneFile,
     law: Annotated[str, typer.Option(help="Law; default: the scene's.")] = "",
-    at: Annotated[float, typer.Option(help="Time of the keys to look at [s].")] = 0.0,
+    at: Annotated[float, typer.Option(help="Time to look at [s].")] = 0.0,
     joint: Annotated[str, typer.Option(help="Joint to draw; default: the one of least margin.")] = "",
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
 ) -> None:
-    """Poles, margins and step response of a scene under its law, linearised about its keys."""
+    """Poles, margins and step response of a scene under its law: about its keys, with contacts about its run."""
     from ..sim.plan import make_plan
     from ..sim.scene.load import load_scene
     from . import design
@@ -170,10 +171,16 @@ def gains(
     own = loaded.controller
     law = law or (own.law if own else "pd")
     words = own.parameters if own and own.law == law else {}
-    system, K = loop_of(make_plan(loaded), law, words, t=at)
+    system, K, says = loop_of(make_plan(loaded), law, words, t=at)
     if joint and joint not in system.inputs:
         raise PantographError(f"no tracked joint {joint!r}; there is: {', '.join(system.inputs)}")
-    console.print(design.controllability(system).says, soft_wrap=True)
+    console.print(f"linearised {says}", soft_wrap=True, highlight=False)
+    verdicts = [design.controllability(system), design.stabilisability(system)]
+    if words.get("observer", "none") != "none":
+        measured = np.eye(len(system.A))[: len(system.A) // 2]
+        verdicts += [design.observability(system, measured), design.detectability(system, measured)]
+    for verdict in verdicts:
+        console.print(verdict.says, soft_wrap=True, highlight=False)
     found = [design.margins(system, K, input=i) for i in range(len(system.inputs))]
     console.print(_margins(system, found), _poles(design.closed_loop(system, K)), sep="\n")
     least = min(range(len(found)), key=lambda i: found[i].disk)

@@ -1,16 +1,20 @@
 """Linear design against closed forms, definitions and brute force."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import control_gains
+from pantograph.controllers import cli
 from pantograph.controllers.design import (
     LinearSystem,
     along,
     closed_loop,
     controllability,
+    detectability,
     dlqr,
     figures,
     finite_horizon,
@@ -21,6 +25,7 @@ from pantograph.controllers.design import (
     lqr,
     margins,
     modes,
+    observability,
     root_locus,
     stabilisability,
     step_info,
@@ -32,6 +37,8 @@ from pantograph.controllers.lqr import LQR
 from pantograph.controllers.nominal import Nominal, moved
 from pantograph.models import load_model
 from pantograph.sim import Scene, make_plan, run
+from pantograph.sim.compose import make_law
+from pantograph.sim.control import Target
 from pantograph.sim.errors import PantographError
 from scipy import linalg
 from strategies import random_states, seeds, trees
@@ -392,7 +399,7 @@ def balancing(law, duration=1.0, **words):
 def test_the_loop_of_a_law_is_the_one_it_was_designed_for():
     words = {"goal": {"hinge": 0.0}}
     plan = make_plan(balancing("lqr", **words))
-    found, K = loop_of(plan, "lqr", words)
+    found, K, _ = loop_of(plan, "lqr", words)
     p = plan.problem
     tracked = np.array([True, False])
     law = LQR(p.model, tracked, p.state0.q, p.clip, 0.01, 1.0, ~(tracked | True), **words)
@@ -418,7 +425,7 @@ def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
     )
     words = {"kp": {"shoulder": 300.0, "elbow": 200.0}, "kd": {"shoulder": 30.0, "elbow": 20.0}}
     plan = make_plan(scene)
-    found, K = loop_of(plan, "pd", words, t=0.4)
+    found, K, _ = loop_of(plan, "pd", words, t=0.4)
     assert found.states[:2] == ("shoulder", "elbow")
     n = len(found.states) // 2
     np.testing.assert_allclose(K[:2, n : n + 2], np.diag([30.0, 20.0]), atol=1e-5)
@@ -437,9 +444,118 @@ def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
 
 def test_the_delay_that_a_loop_stands_is_the_one_that_a_scene_stands():
     words = {"goal": {"hinge": 0.0}, "position": 10.0}
-    found, K = loop_of(make_plan(balancing("lqr", **words)), "lqr", words)
+    found, K, _ = loop_of(make_plan(balancing("lqr", **words)), "lqr", words)
     ticks = int(margins(found, K).delay / 0.01)
     assert 1 <= ticks <= 20
     stood, lost = (run(balancing("lqr", duration=8.0, delay=0.01 * d, **words)) for d in (ticks, ticks + 2))
     assert np.abs(stood.q[-1]).max() < 1e-3
     assert np.abs(lost.q).max() > 0.1
+
+
+def test_both_engines_make_the_same_loop_where_nothing_touches():
+    words = {"goal": {"hinge": 0.0}}
+    scene = balancing("lqr", **words)
+    exact, K, says = loop_of(make_plan(scene), "lqr", words)
+    assert "about the keys at t = 0 s, by exact derivatives; joint limits left out" in says
+    still = {"initial": scene.initial.model_copy(update={"position": {"hinge": 0.0}})}
+    other = scene.model_copy(update={"solver": scene.solver.model_copy(update={"engine": "contact"})} | still)
+    theirs, same, says = loop_of(make_plan(other), "lqr", words)
+    assert "differences of the contact engine; nothing touches" in says
+    np.testing.assert_allclose(theirs.A, exact.A, atol=1e-7)
+    np.testing.assert_allclose(theirs.B, exact.B, atol=1e-7)
+    np.testing.assert_allclose(same, K, rtol=1e-5, atol=1e-5)
+
+
+PRESS = """<mujoco><option timestep="1e-4"/><worldbody><geom type="plane" size="1 1 .1"/>
+  <body name="foot" pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1" damping="30"/>
+  <geom type="sphere" size=".1" mass="1" solref="0.05 1"/></body></worldbody></mujoco>"""
+
+
+def test_a_loop_with_contact_is_the_motion_that_the_contact_engine_makes(tmp_path):
+    """A foot pressed on the floor: one period of a small deviation, simulated finely, and as predicted."""
+    (tmp_path / "press.xml").write_text(PRESS)
+    words, period = {"kp": 200.0, "kd": 5.0}, 0.01
+    scene = Scene(
+        duration=3.0,
+        models=[{"file": str(tmp_path / "press.xml")}],
+        roles={"tracked": ["z"]},
+        keys=[{"joint": "z", "times": [0], "values": [-0.05]}],
+        controller={"law": "pd", "period": period, **words},
+    )
+    plan = make_plan(scene)
+    found, K, says = loop_of(plan, "pd", words | {"delay": 0.01}, t=3.0)
+    assert "touching: foot and world; left out of the loop: delay" in says
+    predicted = closed_loop(found, K).A
+    model, data = plan.problem.model, mujoco.MjData(plan.problem.model)
+    model.opt.timestep, model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    at = run(scene)
+    law = make_law("pd", plan.problem, words, period)
+
+    def after(dq, dv):
+        q, v = at.q[-1] + dq, at.v[-1] + dv
+        tau, _ = law(0.0, q, v, Target(np.array([-0.05]), np.zeros(1), np.zeros(1)), None)
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q, v, tau
+        mujoco.mj_step(model, data, 100)
+        return np.concatenate([data.qpos, data.qvel])
+
+    eps = 1e-5
+    for column, unit in enumerate(eps * np.eye(2)):
+        rate = (after(*unit) - after(*-unit)) / (2 * eps)
+        np.testing.assert_allclose(predicted[:, column], rate, rtol=0.02, atol=1e-3)
+    free = linearise(model, at.q[-1]).A
+    assert abs(predicted[1, 0]) > 3 * abs(closed_loop(held(_like(found, free), period), K).A[1, 0])
+
+
+def _like(system, A):
+    return LinearSystem(A, np.array([[0.0], [1.0]]), system.states, system.inputs)
+
+
+def test_what_positions_show_is_observed():
+    """A pole on a cart: its angle shows all but the cart's place, which no force of the pole tells."""
+    A = linearise(load_model("cart_pole"), np.zeros(2))
+    both, angle = np.eye(4)[:2], np.eye(4)[1:2]
+    assert observability(A, both)
+    assert detectability(A, both)
+    assert not observability(A, angle)
+    verdict = detectability(A, angle)
+    assert not verdict
+    assert "not detectable: nothing measured shows 0" in verdict.says
+    damped = LinearSystem(np.diag([-1.0, -2.0]), np.eye(2), ("a", "b"), ("a", "b"))
+    assert not observability(damped, np.eye(2)[:1])
+    assert "what nothing shows dies out" in detectability(damped, np.eye(2)[:1]).says
+
+
+def test_the_command_says_what_can_be_steered_and_seen(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "press.xml").write_text(PRESS)
+    Path("press.toml").write_text(
+        """duration = 1.0
+[[models]]
+file = "press.xml"
+[roles]
+tracked = ["z"]
+[[keys]]
+joint = "z"
+times = [0]
+values = [-0.05]
+[controller]
+law = "pd"
+period = 0.01
+observer = "filter"
+"""
+    )
+    cli.gains(Path("press.toml"), at=0.5)
+    said = capsys.readouterr().out
+    for words in (
+        "about the run at t = 0.5 s",
+        "touching: foot and world",
+        "controllable by z",
+        "stabilisable",
+    ):
+        assert words in said
+    assert "observable" in said
+    assert "detectable" in said
+    assert {p.name for p in Path("out").iterdir()} == {f"press.{x}.png" for x in ("bode", "locus", "step")}
+    with pytest.raises(PantographError, match="outside the scene, which lasts 1 s"):
+        cli.gains(Path("press.toml"), at=7.0)

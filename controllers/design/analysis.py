@@ -88,21 +88,38 @@ class Verdict:
 def controllability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode."""
     stuck = unsteerable_modes(system.A, system.B, discrete=system.period is not None)
-    if not stuck:
-        return Verdict(True, (), f"controllable by {', '.join(system.inputs)}")
-    listing = ", ".join(map(str, stuck))
-    return Verdict(
-        False, stuck, f"not controllable by {', '.join(system.inputs)}: they cannot move {listing}"
-    )
+    by = ", ".join(system.inputs)
+    return _verdict("controllable", f" by {by}", stuck, f"not controllable by {by}: they cannot move ")
 
 
 def stabilisability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode that does not die out by itself."""
     stuck = unsteerable_modes(system.A, system.B, discrete=system.period is not None)
-    lost = tuple(m for m in stuck if not m.stable)
-    if not lost:
-        return Verdict(True, (), "stabilisable" + (": what no input moves dies out" if stuck else ""))
-    return Verdict(False, lost, "not stabilisable: no input moves " + ", ".join(map(str, lost)))
+    more = ": what no input moves dies out" if stuck else ""
+    return _verdict("stabilisable", more, _lasting(stuck), "not stabilisable: no input moves ")
+
+
+def observability(system: LinearSystem, C: ArrayLike) -> Verdict:
+    """Whether outputs C x (o, n) show every mode."""
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), discrete=system.period is not None)
+    return _verdict("observable", "", unseen, "not observable: nothing measured shows ")
+
+
+def detectability(system: LinearSystem, C: ArrayLike) -> Verdict:
+    """Whether outputs C x (o, n) show every mode that does not die out by itself."""
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), discrete=system.period is not None)
+    more = ": what nothing shows dies out" if unseen else ""
+    return _verdict("detectable", more, _lasting(unseen), "not detectable: nothing measured shows ")
+
+
+def _lasting(modes: tuple[Mode, ...]) -> tuple[Mode, ...]:
+    return tuple(m for m in modes if not m.stable)
+
+
+def _verdict(word: str, more: str, failing: tuple[Mode, ...], otherwise: str) -> Verdict:
+    if not failing:
+        return Verdict(True, (), f"{word}{more}")
+    return Verdict(False, failing, otherwise + ", ".join(map(str, failing)))
 
 
 def closed_loop(system: LinearSystem, K: ArrayLike) -> LinearSystem:

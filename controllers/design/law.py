@@ -1,50 +1,108 @@
-"""The linear loop that a law of a scene makes about its keys: the mechanism, and the gains of the law."""
+"""The linear loop that a law of a scene makes: the mechanism, and the gains of the law."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.compose import make_law
-from ...sim.control import Target
-from ...sim.engines.interface import Role
+from ...models import name_of
+from ...sim.compose import make_engine, make_law
+from ...sim.control import Law, Sampled, Target
+from ...sim.engines.interface import Problem, Role
 from ...sim.errors import PantographError
 from ...sim.plan import Plan
 from ..nominal import Nominal, moved
 from ..preview import aimed
 from ..reality import LOOP_WORDS
-from .linear import LinearSystem, held, linearise
+from .linear import LinearSystem, held, linearise, linearise_contact
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class LinearLoop(NamedTuple):
+    """The sampled mechanism, the gains K (m, n) of a law, and in words about what they are and what is left
+    out."""
+
+    system: LinearSystem
+    K: Array
+    says: str
+
+
+class _Point(NamedTuple):
+    """Where a loop is linearised: time [s], state q, v, target, and the law's memory there."""
+
+    t: float
+    q: Array
+    v: Array
+    target: Target
+    memory: Any
 
 
 def loop_of(
     plan: Plan, law: str, words: Mapping[str, Any], *, t: float = 0.0, step: float = 1e-6
-) -> tuple[LinearSystem, Array]:
-    """The sampled mechanism of a plan about its keys at time ``t`` [s], and the gains K (m, n) of ``law``.
+) -> LinearLoop:
+    """The loop of ``law`` at time ``t`` [s], by derivatives of the engine that the plan chose.
 
-    K is minus the derivative of the law's first forces by the state, by centred differences of ``step``
-    [rad, m, and per second]; memory (integrals, plans) is as at the start, and what sensors and drives do is
-    left out. Joints without keys are at the law's ``goal`` or where they start. Raises PantographError when
-    the scene has nothing to control.
+    On the smooth engine they are exact, about the keys, with the law's memory as at its start; joints without
+    keys are at the law's ``goal`` or where they start. On the contact engine they are differences, contacts
+    and limits included, about the state that a run under the law has at ``t``. K is minus the derivative of
+    the law's forces by the state, by centred differences of ``step`` [rad, m, and per second]; what sensors
+    and drives do is left out. Raises PantographError when the scene has nothing to control, for times outside
+    it, and for a run that does not reach ``t``.
     """
     problem, period = plan.problem, plan.period
     if period is None:
         raise PantographError("this scene has nothing to control: give joints the role 'tracked'")
+    if not 0.0 <= t <= problem.duration:
+        raise PantographError(f"time {t:g} s is outside the scene, which lasts {problem.duration:g} s")
     m, own = problem.model, {word: value for word, value in words.items() if word not in LOOP_WORDS}
+    made = make_law(law, problem, own, period)
     tracked, keyed = problem.dofs(Role.TRACKED), problem.dofs(Role.KEYED)
+    if plan.engine.what == "contact":
+        at = _run_to(plan, made, t)
+        tau, _ = made(at.t, at.q, at.v, at.target, at.memory)
+        pushed, a = np.where(tracked, tau, 0.0), at.target.a
+        mechanism = linearise_contact(m, at.q, at.v, pushed, inputs=tracked, keyed=keyed, a_keyed=a)
+        says = f"about the run at t = {at.t:g} s, by differences of the contact engine; {_touching(m, at.q)}"
+    else:
+        at = _on_keys(problem, made, own, t)
+        need = Nominal(m).inverse(*at.target)
+        mechanism = linearise(m, at.q, at.v, need, inputs=tracked, keyed=keyed, a_keyed=at.target.a)
+        says = f"about the keys at t = {t:g} s, by exact derivatives{_left_out(problem)}"
+    left = ", ".join(word for word in words if word in LOOP_WORDS)
+    says += f"; left out of the loop: {left}" if left else ""
+    return LinearLoop(held(mechanism, period), _gains(made, at, m, tracked, keyed, step), says)
+
+
+def _on_keys(problem: Problem, law: Law, own: Mapping[str, Any], t: float) -> _Point:
     clip, _ = aimed(problem.clip, own.get("goal") or {}, "goal")
     target = Target(*clip.evaluate(t))
-    made = make_law(law, problem, own, period)
-    need = Nominal(m).inverse(*target)
-    chosen = (target.q, target.v, need)
-    mechanism = linearise(m, *chosen, inputs=tracked, keyed=keyed, a_keyed=target.a)
+    return _Point(t, target.q, target.v, target, law.start())
 
+
+def _run_to(plan: Plan, law: Law, t: float) -> _Point:
+    """The state of a run under the law at ``t``, on the grid of its period."""
+    problem, period = plan.problem, plan.period
+    assert period is not None
+    ticks = round(t / period)
+    target = Target(*problem.clip.evaluate(ticks * period))
+    if not ticks:
+        return _Point(0.0, problem.state0.q, problem.state0.v, target, law.start())
+    controls = Sampled(law, problem, period)
+    segment = make_engine(plan.engine.what).run(problem, (0.0, ticks * period), controls)
+    if segment.status != "done":
+        raise PantographError(f"the run to t = {t:g} s under this law ended early: {segment.message}")
+    return _Point(ticks * period, segment.q[-1], segment.v[-1], target, controls.memory)
+
+
+def _gains(law: Law, at: _Point, m: mujoco.MjModel, tracked: Mask, keyed: Mask, step: float) -> Array:
     def forces(dq: Array, dv: Array) -> Array:
-        tau, _ = made(t, moved(m, target.q, dq), target.v + dv, target, made.start())
+        tau, _ = law(at.t, moved(m, at.q, dq), at.v + dv, at.target, at.memory)
         return tau[tracked]
 
     none, columns = np.zeros(m.nv), []
@@ -52,4 +110,31 @@ def loop_of(
         for unit in step * np.eye(m.nv)[~keyed]:
             plus, minus = ((none, s * unit) if of_speed else (s * unit, none) for s in (1.0, -1.0))
             columns.append((forces(*minus) - forces(*plus)) / (2.0 * step))
-    return held(mechanism, period), np.column_stack(columns)
+    return np.column_stack(columns)
+
+
+def _touching(m: mujoco.MjModel, q: Array) -> str:
+    """Pairs of bodies that touch at q, in words."""
+    data = mujoco.MjData(m)
+    data.qpos[:] = q
+    mujoco.mj_forward(m, data)
+    pairs = {
+        tuple(sorted(name_of(m, "body", int(m.geom_bodyid[g])) for g in data.contact.geom[i]))
+        for i in range(data.ncon)
+        if data.contact.dist[i] <= 0.0
+    }
+    return (
+        f"touching: {', '.join(' and '.join(pair) for pair in sorted(pairs))}" if pairs else "nothing touches"
+    )
+
+
+def _left_out(problem: Problem) -> str:
+    """What of the scene's physics the exact derivatives do not have, in words."""
+    m = problem.model
+    off = int(m.opt.disableflags)
+    parts = {
+        "joint limits": m.jnt_limited.any() and not off & int(mujoco.mjtDisableBit.mjDSBL_LIMIT),
+        "dry friction": m.dof_frictionloss.any() and not off & int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS),
+    }
+    names = " and ".join(name for name, there in parts.items() if there)
+    return f"; {names} left out" if names else ""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...models import name_of
+from ...models import dof_names
 from ...sim.engines.prescribe import Prescriber
 from ...sim.kinds import BALL, FREE
 from ..nominal import Nominal, moved
@@ -173,7 +173,7 @@ def _blocks(
 def _named(
     model: mujoco.MjModel, free: NDArray[np.bool_], inputs: NDArray[np.bool_], A: Array, B: Array
 ) -> LinearSystem:
-    names = _freedoms(model)
+    names = dof_names(model)
     states = [names[i] for i in np.flatnonzero(free)]
     rates = [f"{name} rate" for name in states]
     return LinearSystem(A, B, (*states, *rates), tuple(names[i] for i in np.flatnonzero(inputs)))
@@ -187,15 +187,3 @@ def _turning(model: mujoco.MjModel, v: Array) -> Array:
         x, y, z = v[at : at + 3]
         out[at : at + 3, at : at + 3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return out
-
-
-def _freedoms(model: mujoco.MjModel) -> list[str]:
-    """A name for every degree of freedom: its joint's, with a letter where the joint has several."""
-    letters = {int(FREE): ("x", "y", "z", "rx", "ry", "rz"), int(BALL): ("rx", "ry", "rz")}
-    names = []
-    for joint in range(model.njnt):
-        name = name_of(model, "joint", joint)
-        names += (
-            [f"{name}.{x}" for x in letters[k]] if (k := int(model.jnt_type[joint])) in letters else [name]
-        )
-    return names
