@@ -62,7 +62,7 @@ def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
         derived = derive(problem, segment)
         notes = check_frames(setup, segment.t, segment.q)
         missed = _missed(setup, segment)
-        notes += _sentences(missed, segment.t)
+        notes += _sentences(setup, missed, segment.t)
         if engine is not None and status == "done" and segment.stats["steps"]:
             estimate = estimate_error(engine, problem, segment, plan.period)
     except EngineError as e:
@@ -110,12 +110,12 @@ def _missed(setup: Setup, segment: Segment) -> dict[str, Array]:
     return deviations(setup.scene, setup.model, segment.t, segment.q)
 
 
-def _sentences(missed: dict[str, Array], t: Array) -> list[str]:
+def _sentences(setup: Setup, missed: dict[str, Array], t: Array) -> list[str]:
     if not missed:
         return []
     from .scene.goals import sentences
 
-    return sentences(missed, t)
+    return sentences(setup.scene, setup.model, missed, t)
 
 
 def _versions() -> dict[str, str]:

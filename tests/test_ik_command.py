@@ -1,11 +1,16 @@
 """The command `pantograph ik`."""
 
+import mujoco
+import numpy as np
 import pytest
 import typer
 from gl import needs_gl
+from pantograph.models import load_model
 from pantograph.sim.cli.ik import ik
 from pantograph.sim.errors import PantographError
 from typer.testing import CliRunner
+
+ARM = ("left_shoulder_pitch", "left_shoulder_roll", "left_shoulder_yaw", "left_elbow")
 
 
 def _run(*words):
@@ -37,6 +42,23 @@ def test_feet_can_be_held_and_joints_named_by_patterns():
     assert code == 0 and "left_elbow" in text and "root" not in text and "waist" not in text
 
 
+def test_named_geoms_are_kept_clear():
+    """The forearm passes the belly; where it may, it keeps away."""
+    model, words = load_model("puppet"), ("puppet", "--site", "left_hand", "--to", "0.2,0,0.65")
+    words = (*words, *(word for name in ARM for word in ("--joint", name)))
+    data, clear = mujoco.MjData(model), []
+    for more in ((), ("--obstacle", "left_forearm_link,belly")):
+        code, text = _run(*words, *more)
+        assert code == 0
+        for name in ARM:
+            data.qpos[model.joint(name).qposadr[0]] = float(text.split(f"{name} ")[1].split()[1])
+        mujoco.mj_kinematics(model, data)
+        pair = (model.geom(name).id for name in ("left_forearm_link", "belly"))
+        clear.append(mujoco.mj_geomDistance(model, data, *pair, 1.0, None))
+        np.testing.assert_allclose(data.site("left_hand").xpos, [0.2, 0, 0.65], atol=1e-4)
+    assert clear[0] < 0.0 and clear[1] > 0.03
+
+
 @needs_gl
 def test_the_way_can_be_pictured(tmp_path):
     code, _ = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")
@@ -55,6 +77,12 @@ def test_the_way_can_be_pictured(tmp_path):
         (("arm6", "--to", "1,0,0", "--joint", "x*"), "waist"),
         (("arm6", "--to", "1,0,0", "--hold", "tipp"), "tip"),
         (("arm6", "--to", "1,0,0", "--keyframe", "none such"), "no keyframe"),
+        (("arm6", "--to", "1,0,0", "--prefer", "clear"), "--obstacle GEOM,GEOM"),
+        (("arm6", "--to", "1,0,0", "--prefer", "middle", "--obstacle", "floor,base_foot"), "--prefer clear"),
+        (("arm6", "--to", "1,0,0", "--obstacle", "floor"), "pair of geoms"),
+        (("arm6", "--to", "1,0,0", "--obstacle", "floor,flor"), "no geom 'flor'"),
+        (("arm6", "--to", "1,0,0", "--obstacle", "base_plate,base_foot"), "never part"),
+        (("arm6", "--to", "1,0,0", "--prefer", "best"), "manipulability"),
     ],
 )
 def test_mistakes_are_told(words, message):

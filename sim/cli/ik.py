@@ -29,7 +29,12 @@ def ik(
         list[str] | None, typer.Option(help="Site or body:NAME that keeps its pose, as a foot on the ground.")
     ] = None,
     keyframe: Annotated[str | None, typer.Option(help="Keyframe of the model to start from.")] = None,
-    prefer: Annotated[str, typer.Option(help="near, middle or manipulability.")] = "near",
+    prefer: Annotated[
+        str | None, typer.Option(help="near (default), middle, manipulability, or clear of --obstacle.")
+    ] = None,
+    obstacle: Annotated[
+        list[str] | None, typer.Option(help="Pair of geoms that the pose stays clear of, as GEOM,GEOM.")
+    ] = None,
     every: Annotated[bool, typer.Option("--all", help="List all distinct solutions.")] = False,
     film: Annotated[
         Path | None, typer.Option(help="Film the way there: .mp4, .gif, or a picture .png.")
@@ -45,7 +50,8 @@ def ik(
     start = _start(loaded, keyframe)
     goals = [_goal(loaded, site, to), *(_held(loaded, name, start) for name in hold or [])]
     solution = solve(
-        loaded, goals, q0=start, joints=_joints(loaded, joint), prefer=prefer,  # type: ignore[arg-type]
+        loaded, goals, q0=start, joints=_joints(loaded, joint),
+        prefer=_preference(prefer, obstacle), obstacles=_pairs(loaded, obstacle),  # type: ignore[arg-type]
         restarts=restarts, seed=seed, all=every,
     )  # fmt: skip
     _show(loaded, solution, start)
@@ -79,6 +85,32 @@ def _joints(model: Any, patterns: list[str] | None) -> list[str] | None:
         if not found:
             raise PantographError(names.missing(pattern))
         out += [by_id[i] for i in found]
+    return out
+
+
+def _preference(prefer: str | None, obstacles: list[str] | None) -> str:
+    """What decides between poses: who names obstacles wants to be clear of them."""
+    if obstacles and prefer not in (None, "clear"):
+        raise PantographError(f"--obstacle belongs to --prefer clear, not to --prefer {prefer}")
+    if prefer == "clear" and not obstacles:
+        raise PantographError("--prefer clear needs the pairs of geoms to keep apart: --obstacle GEOM,GEOM")
+    return prefer or ("clear" if obstacles else "near")
+
+
+def _pairs(model: Any, obstacles: list[str] | None) -> list[tuple[str, str]]:
+    """Pairs of geoms from the words of the command line."""
+    from ...models import names_of
+    from ..errors import unknown
+
+    out, geoms = [], names_of(model, "geom")
+    for text in obstacles or []:
+        pair = text.split(",")
+        if len(pair) != 2:
+            raise PantographError(f"--obstacle is a pair of geoms, GEOM,GEOM, not {text!r}")
+        for name in pair:
+            if name not in geoms:
+                raise PantographError(unknown("geom", name, geoms))
+        out.append((pair[0], pair[1]))
     return out
 
 

@@ -31,7 +31,7 @@ from .space import Space
 from .verdict import Residual
 
 Array = NDArray[np.float64]
-_HARD = 1e4  # weight of hard goals and loops over wishes of weight 1
+_HARD = 1e6  # weight of hard goals and loops over wishes of weight 1
 _LEAST = 1e-8  # damping; it grows where steps do not help, before goals that cannot be met
 _CLOSE = 1e-20
 _SHARE = 0.5  # of the distance to a geom that a tick may use up

@@ -289,8 +289,9 @@ def _tightened(line: _Line, q: Array) -> Array:
             if problem.met(rows.r)[0]:
                 out[k] = x[0]
                 break
-            hard = problem.judged
-            d = np.linalg.lstsq(w.J[0][hard], -w.r[0][hard], rcond=1e-6)[0]
+            r, J = w.r[0][problem.judged], w.J[0][problem.judged]
+            free = line.space.free_directions(x, (J.T @ r)[None])[0][0]  # not against a limit
+            d = np.linalg.lstsq(J * free, -r, rcond=1e-6)[0]
             if np.abs(d).max(initial=0.0) > _SMALL:
                 break
             x = line.space.step(x, d[None])

@@ -57,4 +57,5 @@ Colour = Annotated[
     tuple[Finite, Finite, Finite] | tuple[Finite, Finite, Finite, Finite], BeforeValidator(_row(3, 4))
 ]
 Pair = Annotated[tuple[str, str], BeforeValidator(_row(2, of="names"))]
+Span = Annotated[tuple[Finite, Finite], BeforeValidator(_row(2))]
 Row = Finite | list[Finite]

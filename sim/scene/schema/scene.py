@@ -21,9 +21,10 @@ from ..mistakes import report
 from ..values import NotNegative, Pair, Positive, Row, Switch, Vector, at
 from ..words import mistakes_of
 from .film import CameraItem, FilmItem, LightItem
+from .goal import GoalItem
 from .item import Item
 from .things import ModelItem, PropItem
-from .timed import ForceItem, GoalItem, KeysItem
+from .timed import ForceItem, KeysItem
 
 
 class Initial(Item):

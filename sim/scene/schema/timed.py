@@ -1,4 +1,4 @@
-"""What a scene says over time: keys, goals and forces."""
+"""What a scene says over time: keys and forces."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from ...curves import check_kind
 from ...errors import KeyingError
-from ..values import Finite, Positive, Row, Vector, at
+from ..values import Finite, Row, Vector, at
 from .item import Item
 
 Curve = Literal["step", "linear", "auto", "natural", "clamped"]
@@ -77,43 +77,6 @@ class KeysItem(Timed):
             raise at("values", message=message)
         if len({len(r) if isinstance(r, list) else 0 for r in self.values}) > 1:
             raise at("values", message="every value needs the same number of components")
-        return self
-
-
-class GoalItem(Timed):
-    """What a site or body does over time; joints without keys are solved for it (inverse kinematics)."""
-
-    at: str = Field(description="site, or body:NAME")
-    position: list[Vector] | None = Field(None, description="of its origin, metres, one row a time")
-    rotation: list[Row] | None = Field(None, description="w, x, y, z or euler x, y, z, one row a time")
-    look_at: list[Vector] | None = Field(None, description="point that its axis points to, one row a time")
-    axis: Vector = Field((0.0, 0.0, 1.0), description="local axis that looks")
-    relative_to: str | None = Field(
-        None, description="site or body:NAME that carries the goal; default world"
-    )
-    solve: Literal["auto", "baked", "live"] = Field(
-        "auto",
-        description="before the run, smooth over all of it; or live, tick by tick from the state of the run",
-    )
-    velocity: Positive | None = Field(
-        None,
-        description="limit of its joints, scene angles or metres a second; live default: half a turn, 1 m",
-    )
-    acceleration: Positive | None = Field(
-        None, description="likewise, per second squared; live default: 3 turns, 10 m"
-    )
-    weight: Positive | None = Field(None, description="a wish of this weight; without it, a hard goal")
-    joints: list[str] = Field(default_factory=list, description="names or patterns; default all that move it")
-
-    @model_validator(mode="after")
-    def _something(self) -> GoalItem:
-        given = [w for w in ("position", "rotation", "look_at") if getattr(self, w) is not None]
-        if not given:
-            raise at(message="a goal says where to: give 'position', 'rotation', 'look_at', or several")
-        for word in given:
-            rows = getattr(self, word)
-            if len(rows) != len(self.times):
-                raise at(word, message=f"{len(self.times)} times but {len(rows)} rows; give one row a time")
         return self
 
 
