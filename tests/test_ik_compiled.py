@@ -23,7 +23,8 @@ from pantograph.sim.ik import (
 )
 from pantograph.sim.ik.animate import Pole, Spread
 from pantograph.sim.ik.chains import machine as machines
-from pantograph.sim.ik.chains.iteration import arguments, layout, rows_tape
+from pantograph.sim.ik.chains.iteration import rows_tape
+from pantograph.sim.ik.chains.layout import arguments, layout
 from pantograph.sim.ik.numeric.descend import _descend
 from pantograph.sim.ik.numeric.settle import settle, settle_near, worth
 from pantograph.sim.ik.preferences import preference

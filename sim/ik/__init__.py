@@ -8,9 +8,10 @@ out of reach
 
 from .animate import Pole, Spread, blend, soften
 from .chains.solver import ChainSolver
-from .goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from .goals import Distance, Goal, LookAt, Orientation, PointOnLine, PointOnPlane, Pose, Position
 from .lock import Locked, Slide, lock
 from .loops import Loops, Projection
+from .mirror import Mirror
 from .solve import solve
 from .stream import Follower, Tick
 from .track import Motion, follow

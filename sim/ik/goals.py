@@ -122,7 +122,8 @@ def number(name: str, x: object) -> float:
     return float(x)
 
 
-def _unit(name: str, x: ArrayLike, n: int = 3) -> Array:
+def unit(name: str, x: ArrayLike, n: int = 3) -> Array:
+    """`x` at length one; ModelError with `name` for what gives no direction."""
     out = vector(name, x, n)
     length = np.linalg.norm(out)
     if length < 1e-12:
@@ -130,7 +131,7 @@ def _unit(name: str, x: ArrayLike, n: int = 3) -> Array:
     return np.asarray(out / length)
 
 
-def _seen_from(c: Configurations, at: str, base: str | None) -> Moving:
+def seen_from(c: Configurations, at: str, base: str | None) -> Moving:
     """Frame `at` in the frame `base` (None: the world), with Jacobians of that relative pose."""
     f = c.frame(at)
     if base is None:
@@ -161,7 +162,7 @@ class Position(Goal):
         return ("m",) * 3
 
     def rows(self, c: Configurations) -> Rows:
-        f = _seen_from(c, self.at, self.relative_to)
+        f = seen_from(c, self.at, self.relative_to)
         return Rows(f.p - np.asarray(self.target), f.Jv)
 
 
@@ -178,7 +179,7 @@ class Orientation(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
+        object.__setattr__(self, "quat", unit("quat", self.quat, 4))
 
     @cached_property
     def back(self) -> Array:
@@ -192,7 +193,7 @@ class Orientation(Goal):
         return ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
-        return _turn_rows(_seen_from(c, self.at, self.relative_to), self.back)
+        return _turn_rows(seen_from(c, self.at, self.relative_to), self.back)
 
 
 def _turn_rows(f: Moving, back: Array) -> Rows:
@@ -213,7 +214,7 @@ class Pose(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "position", vector("position", self.position))
-        object.__setattr__(self, "quat", _unit("quat", self.quat, 4))
+        object.__setattr__(self, "quat", unit("quat", self.quat, 4))
 
     @cached_property
     def back(self) -> Array:
@@ -227,7 +228,7 @@ class Pose(Goal):
         return ("m",) * 3 + ("rad",) * 3
 
     def rows(self, c: Configurations) -> Rows:
-        f = _seen_from(c, self.at, self.relative_to)
+        f = seen_from(c, self.at, self.relative_to)
         turn = _turn_rows(f, self.back)
         return Rows(
             np.concatenate([f.p - np.asarray(self.position), turn.r], axis=1),
@@ -250,7 +251,7 @@ class LookAt(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "target", vector("target", self.target))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "axis", unit("axis", self.axis))
 
     def frames(self) -> tuple[str, ...]:
         return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
@@ -286,7 +287,7 @@ class PointOnLine(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "point", vector("point", self.point))
-        object.__setattr__(self, "direction", _unit("direction", self.direction))
+        object.__setattr__(self, "direction", unit("direction", self.direction))
 
     def frames(self) -> tuple[str, ...]:
         return (self.at,)
@@ -311,7 +312,7 @@ class PointOnPlane(Goal):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "point", vector("point", self.point))
-        object.__setattr__(self, "normal", _unit("normal", self.normal))
+        object.__setattr__(self, "normal", unit("normal", self.normal))
 
     def frames(self) -> tuple[str, ...]:
         return (self.at,)
@@ -356,59 +357,3 @@ class Distance(Goal):
         long = _norm(p)
         u = p / np.maximum(long, 1e-12)[:, None]
         return Rows(long[:, None] - self.distance, u[:, None, :] @ J)
-
-
-@dataclass(frozen=True, eq=False)
-class Mirror(Goal):
-    """`at` is the mirror image of `of` in the plane through `point` along `normal`.
-
-    With `relative_to`, the plane is fixed in that frame, so that a limb mirrors another on a turned trunk.
-    `what`: its origin ("position"), how it is turned ("orientation"), or both ("pose"). The image of a frame
-    has left-handed axes; its `flip` axis, in axes of the frame, is turned around to make them right-handed:
-    R_at = S R_of S_flip with S_n = 1 - 2 n n^T. Default `flip`: the normal, for frames whose axes are those
-    of the plane's frame where limbs hang at rest.
-    """
-
-    at: str
-    of: str
-    normal: ArrayLike = (0.0, 1.0, 0.0)
-    point: ArrayLike = (0.0, 0.0, 0.0)
-    relative_to: str | None = None
-    what: Literal["position", "orientation", "pose"] = "position"
-    flip: ArrayLike | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "normal", _unit("normal", self.normal))
-        object.__setattr__(self, "point", vector("point", self.point))
-        object.__setattr__(self, "flip", self.normal if self.flip is None else _unit("flip", self.flip))
-        if self.what not in ("position", "orientation", "pose"):
-            raise ModelError(f"a mirror is of the position, the orientation or the pose, not {self.what!r}")
-
-    def frames(self) -> tuple[str, ...]:
-        return (self.at, self.of) if self.relative_to is None else (self.at, self.of, self.relative_to)
-
-    def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
-        place: tuple[Unit, ...] = ("m",) * 3
-        turn: tuple[Unit, ...] = ("rad",) * 3
-        return {"position": place, "orientation": turn, "pose": place + turn}[self.what]
-
-    def rows(self, c: Configurations) -> Rows:
-        f, g = (_seen_from(c, at, self.relative_to) for at in (self.at, self.of))
-        S, point = _reflection(np.asarray(self.normal)), np.asarray(self.point)
-        place = Rows(f.p - (g.p - point) @ S - point, f.Jv - S @ g.Jv)
-        if self.what == "position":
-            return place
-        image = S @ g.R @ _reflection(np.asarray(self.flip))
-        back = image.transpose(0, 2, 1)
-        phi = rotations.log(rotations.from_matrix(back @ f.R))
-        # a mirrored turn goes the other way around the mirrored axis: S [w] S = [-S w]
-        turn = Rows(phi, rotations.inverse_right_jacobian(-phi) @ (back @ (f.Jw + S @ g.Jw)))
-        if self.what == "orientation":
-            return turn
-        return Rows(np.concatenate([place.r, turn.r], axis=1), np.concatenate([place.J, turn.J], axis=1))
-
-
-def _reflection(n: Array) -> Array:
-    """1 - 2 n n^T: mirror in the plane along the unit vector n."""
-    return np.asarray(np.eye(3) - 2 * np.outer(n, n))

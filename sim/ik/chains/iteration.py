@@ -14,16 +14,17 @@ freedoms than rows the first comes from the freedoms' side, and there is no seco
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...compile.graph import Graph, Node, Scalar, absolute, clip, cos, less, maximum, minimum, sin, sqrt
 from ...compile.tape import Tape
-from ..space import Ball
 from .algebra import dot, log_quaternion, multiplied, scaled, solved, total
-from .rows import Row, Scene, aims, difference, problem_rows
+from .layout import Layout, Split, Weights, split
+from .rows import Row, difference, problem_rows
+from .seen import Scene
 
 if TYPE_CHECKING:
     from ..problem import Problem
@@ -33,126 +34,7 @@ LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves t
 LEAST = 1e-15
 _FIRM = 1e-13  # damping along the goals, where their rows depend on each other
 _SHARES = 0.1, 8.0
-_FAR, _TINY = 1e300, 1e-300  # stand for infinity and zero
-
-
-class Layout(NamedTuple):
-    """Where the numbers of a problem are in the arguments of its compiled iteration.
-
-    Arguments are: aims, weights and inverse tolerances of live rows, bands, limits, then for the way along
-    the goals aims, weights and bands of wishes, s, whether to go along at all (1 or 0), and q0.
-    """
-
-    aims: int
-    moved: NDArray[np.intp]  # freedoms
-    live: NDArray[np.intp]  # rows that count
-    banded: NDArray[np.intp]  # rows with room
-    scalars: NDArray[np.intp]  # freedoms of moved hinges and slides with limits
-    balls: tuple[Ball, ...]  # moved balls with limits
-    soft_aims: int
-    soft: NDArray[np.intp]  # wished rows that count
-    soft_banded: NDArray[np.intp]
-    along: bool
-    nq: int
-
-    @property
-    def size(self) -> int:
-        """Number of arguments."""
-        down = self.aims + 2 * len(self.live) + len(self.banded) + 2 * len(self.scalars) + len(self.balls)
-        rest = self.soft_aims + len(self.soft) + len(self.soft_banded) + 2 + self.nq
-        return down + (rest if self.along else 0)
-
-    @property
-    def steps(self) -> int:
-        """Number of freedoms on the way along the goals."""
-        return len(self.moved) if self.along else 0
-
-    @property
-    def holds(self) -> int:
-        """Number of limits that can hold."""
-        return len(self.scalars) + len(self.balls) + len(self.banded)
-
-
-def layout(problem: Problem) -> Layout:
-    """The layout of a problem; all problems of one structure share it."""
-    model, space, wished = problem.model, problem.space, problem.wished
-    limited = model.jnt_limited[model.dof_jntid].astype(bool)
-    scalars = [v for v in space.scalar_v if problem.moved[v] and limited[v]]
-    balls = tuple(b for b in space.balls if problem.moved[b.v] and limited[b.v])
-    live, banded = _counting(problem)
-    free = np.flatnonzero(problem.moved)
-    along = len(live) <= len(free)
-    none = np.zeros(0, dtype=int)
-    soft, soft_banded = (none, none) if wished is None or not along else _counting(wished)
-    return Layout(
-        len(aims(problem)), free, live, banded, np.array(scalars, dtype=int), balls,
-        0 if wished is None or not along else len(aims(wished)), soft, soft_banded, along, space.nq,
-    )  # fmt: skip
-
-
-def _counting(problem: Problem) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows that count, and among them those with room."""
-    live = np.flatnonzero(np.isfinite(problem.tolerance))
-    return live, live[problem.band[live] > 0]
-
-
-def arguments(problem: Problem, at: Layout, *, q0: Array | None = None, s: float = 1.0) -> Array:
-    """The numbers to go down to a problem's goals, or along them to its wishes and, by s, to q0 (nq,)."""
-    live, space, wished = at.live, problem.space, problem.wished
-    now = {b.v: b.limit for b in space.balls}
-    parts = [
-        aims(problem), problem.weight[live], np.where(problem.judged, 1.0 / problem.tolerance, 0.0)[live],
-        problem.band[at.banded], space.low[at.scalars], space.high[at.scalars],
-        np.array([now[b.v] for b in at.balls]),
-    ]  # fmt: skip
-    if at.along:
-        off = q0 is None
-        if wished is not None:
-            parts += [aims(wished), wished.weight[at.soft] * (not off), wished.band[at.soft_banded]]
-        parts += [np.array([s, 0.0 if off else 1.0]), problem.model.qpos0 if q0 is None else q0]
-    return np.asarray(np.clip(np.concatenate(parts), -_FAR, _FAR))
-
-
-class _Weights(NamedTuple):
-    weight: dict[int, Node]
-    band: dict[int, Node]
-
-
-class _Split(NamedTuple):
-    """Arguments as symbols, by row or by freedom."""
-
-    aims: Sequence[Node]
-    hard: _Weights
-    share: dict[int, Node]
-    low: dict[int, Node]
-    high: dict[int, Node]
-    limit: dict[int, Node]
-    soft_aims: Sequence[Node]
-    soft: _Weights
-    s: Scalar
-    pull: Scalar
-    q0: Sequence[Node]
-
-
-def _split(at: Layout, a: Sequence[Node]) -> _Split:
-    rest = iter(a)
-
-    def next_few(n: int) -> list[Node]:
-        return [next(rest) for _ in range(n)]
-
-    def taken(keys: Sequence[int] | NDArray[np.intp]) -> dict[int, Node]:
-        return {int(k): next(rest) for k in keys}
-
-    goal, weight, share, band = next_few(at.aims), taken(at.live), taken(at.live), taken(at.banded)
-    low, high, limit = taken(at.scalars), taken(at.scalars), taken([b.v for b in at.balls])
-    if not at.along:
-        return _Split(
-            goal, _Weights(weight, band), share, low, high, limit, [], _Weights({}, {}), 1.0, 0.0, []
-        )
-    soft_aims, soft = next_few(at.soft_aims), _Weights(taken(at.soft), taken(at.soft_banded))
-    s, pull = next_few(2)
-    return _Split(goal, _Weights(weight, band), share, low, high, limit, soft_aims, soft, s, pull,
-                  next_few(at.nq))  # fmt: skip
+_TINY = 1e-300  # stands for zero
 
 
 def rows_tape(problem: Problem, at: Layout) -> tuple[Tape, list[tuple[int, int]]]:
@@ -162,7 +44,7 @@ def rows_tape(problem: Problem, at: Layout) -> tuple[Tape, list[tuple[int, int]]
     """
     graph = Graph()
     q, a = graph.inputs("q", problem.space.nq), graph.inputs("a", at.size)
-    given = _split(at, a)
+    given = split(at, a)
     rows = problem_rows(Scene(problem, q), given.aims)
     if at.along and problem.wished is not None:
         rows += problem_rows(Scene(problem.wished, q), given.soft_aims)
@@ -182,7 +64,7 @@ def iteration_tape(problem: Problem, at: Layout) -> Tape:
     graph, nq = Graph(), problem.space.nq
     q, mu, hold = graph.inputs("q", nq), graph.inputs("mu", 1), graph.inputs("hold", at.holds)
     past, before = graph.inputs("past", 2), graph.inputs("before", at.steps)
-    given = _split(at, graph.inputs("a", at.size))
+    given = split(at, graph.inputs("a", at.size))
     rows = problem_rows(Scene(problem, q), given.aims)
     worst: Scalar = 0.0
     for i, inverse in given.share.items():
@@ -242,7 +124,7 @@ def _share(past: Sequence[Node], inner: Scalar, pull: Scalar) -> Scalar:
 
 
 def _weighted(
-    rows: list[Row], given: _Weights, edges: dict[int, Node] | None = None, pull: Scalar = 0.0
+    rows: list[Row], given: Weights, edges: dict[int, Node] | None = None, pull: Scalar = 0.0
 ) -> tuple[list[Scalar], list[dict[int, Scalar]]]:
     """Residuals and Jacobian as the solver sees them (`Problem.weighted`).
 
@@ -268,7 +150,7 @@ def _side(r: Scalar) -> Scalar:
     return 1.0 - 2.0 * less(r, 0.0)
 
 
-def _edges(rows: list[Row], given: _Weights, edges: dict[int, Node], y: list[Scalar]) -> list[Scalar]:
+def _edges(rows: list[Row], given: Weights, edges: dict[int, Node], y: list[Scalar]) -> list[Scalar]:
     """Which rows are at the edge of their room from now on: those beyond it, and those pushed against it."""
     out: list[Scalar] = []
     for i, multiplier in zip(given.weight, y, strict=False):
@@ -285,7 +167,7 @@ def _columns(J: list[dict[int, Scalar]]) -> list[int]:
 class _Holds:
     """Limits that hold: going down those that the gradient pushes outward, going along the named ones."""
 
-    def __init__(self, problem: Problem, q: Sequence[Node], at: Layout, given: _Split, hold: Sequence[Node]):
+    def __init__(self, problem: Problem, q: Sequence[Node], at: Layout, given: Split, hold: Sequence[Node]):
         self.problem, self.q, self.at, self.given = problem, q, at, given
         self.named = dict(zip([*map(int, at.scalars), *(b.v for b in at.balls)], hold, strict=False))
         self.free: dict[int, Scalar] = {}
@@ -366,7 +248,7 @@ def _by_freedoms(
     return {v: -x for v, x in zip(columns, solved(A, [damping] * len(b), b), strict=True)}
 
 
-def moved(problem: Problem, q: Sequence[Node], given: _Split, d: dict[int, Scalar]) -> list[Scalar]:
+def moved(problem: Problem, q: Sequence[Node], given: Split, d: dict[int, Scalar]) -> list[Scalar]:
     """q after the step d, inside the limits (`Space.step`)."""
     space, out = problem.space, list[Scalar](q)
     for i, v in zip(space.scalar_q, space.scalar_v, strict=True):

@@ -21,7 +21,8 @@ from ...compile.llvm import Emitter, declarations
 from ...compile.loops import Block, declare, function, map_function
 from ...compile.program import address, facts_of, obtain
 from ..goals import Goal, Rows
-from .iteration import Layout, arguments, iteration_tape, layout, rows_tape
+from .iteration import iteration_tape, rows_tape
+from .layout import Layout, arguments, layout
 from .rows import expressible
 
 if TYPE_CHECKING:
@@ -269,7 +270,7 @@ class Machine:
 @lru_cache(maxsize=1)
 def _source() -> str:
     here = Path(__file__).parent
-    files = [here / f"{name}.py" for name in ("machine", "iteration", "rows", "algebra")]
+    files = [here / f"{name}.py" for name in ("machine", "iteration", "layout", "rows", "seen", "algebra")]
     files += sorted((here.parents[1] / "compile").glob("*.py"))
     return key_of(*(file.read_bytes() for file in files))
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ...kinds import FREE, HINGE, SLIDE
 from ...kinematics import Frame
-from ..goals import LookAt, Mirror
+from ..goals import LookAt
+from ..mirror import Mirror
 from ..problem import Problem
 from ..wholes import CenterOfMass
 from .reach import at_point, hops_of, path, reach

@@ -12,7 +12,8 @@ from ... import rotations
 from ...kinds import HINGE, SLIDE
 from ...kinematics import Frame
 from ..chains.closed_form import ClosedForm
-from ..goals import Distance, Goal, LookAt, Mirror, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from ..goals import Distance, Goal, LookAt, Orientation, PointOnLine, PointOnPlane, Pose, Position
+from ..mirror import Mirror
 from ..problem import Problem
 from ..wholes import CenterOfMass, JointValue, scalar_joint
 from .balls import mass_gap, mirror_gap, sight_gap
