@@ -14,6 +14,7 @@ import pytest
 from gl import needs_gl
 from pantograph.sim import Scene, load, load_scene, make_plan, run
 from pantograph.sim.cli.app import run_app
+from test_servo_faults import RIG
 
 SCENES = Path(__file__).parents[1] / "models" / "scenes"
 SWING = 'duration = 0.3\ntitle = "swing"\n[[models]]\nfile = "pendulum"\n[initial.position]\nhinge = 1\n'
@@ -359,6 +360,42 @@ def test_ctrl_c_keeps_what_was_recorded(folder, engine):
     assert r.status == "interrupted"
     assert 0 < r.t[-1] < 1e5
     assert len(r.t) == len(r.q) == len(r.a)
+
+
+INTERRUPTING = """\
+import importlib, os, signal, sys
+os.kill(os.getpid(), signal.SIGINT)
+sys.path.remove({folder!r})
+del sys.modules[{name!r}]
+sys.modules[{name!r}] = importlib.import_module({name!r})
+"""
+
+
+@pytest.mark.parametrize(
+    ("library", "words"),
+    [
+        ("mujoco", ("models",)),
+        ("typer", ("servo", "--help")),
+        ("rich", ("run", "swing.toml")),
+        ("llvmlite", ("run", "swing.toml")),
+        ("matplotlib", ("report", "swing.toml")),
+        ("dynamixel_sdk", ("servo", "jog", "rig.toml", "elbow", "1")),
+    ],
+)
+def test_ctrl_c_while_a_library_loads_is_one_line(folder, library, words):
+    (folder / "rig.toml").write_text(RIG)
+    (folder / "first").mkdir()
+    interrupting = INTERRUPTING.format(folder=str(folder / "first"), name=library)
+    (folder / "first" / f"{library}.py").write_text(interrupting)
+    path = os.pathsep.join([str(folder / "first"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    process = subprocess.run(
+        [sys.executable, "-m", "pantograph.sim", *words],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (process.returncode, process.stderr) == (130, "interrupted\n"), process.stdout
 
 
 def test_a_users_own_modules_do_not_break_the_command(folder):
