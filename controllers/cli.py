@@ -160,7 +160,7 @@ def gains(
     joint: Annotated[str, typer.Option(help="Joint to draw; default: the one of least margin.")] = "",
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
 ) -> None:
-    """Poles, margins and step response of a scene under its law: about its keys, with contacts about its run."""
+    """Poles, margins and step response of a scene under its law, about its keys (with contacts: its run)."""
     from ..sim.plan import make_plan
     from ..sim.scene.load import load_scene
     from . import design

@@ -31,7 +31,10 @@ class Mode:
         return self.pole.real
 
     def __str__(self) -> str:
-        return f"{self.pole:.4g} ({'stable' if self.stable else 'unstable'})"
+        if not np.isfinite(self.frequency):
+            return f"{self.pole:.4g} ({'stable' if self.stable else 'unstable'})"
+        stable = "dies out" if self.stable else "does not die out"
+        return f"{self.frequency:.4g} rad/s (damping {self.damping:.3g}, {stable})"
 
 
 def modes(A: ArrayLike, *, period: float | None = None) -> tuple[Mode, ...]:
@@ -52,7 +55,9 @@ def _mode(pole: complex, *, discrete: bool, period: float | None = None) -> Mode
     return Mode(pole, abs(s), -s.real / abs(s) if s else 1.0, stable)
 
 
-def unsteerable_modes(A: Array, B: Array, *, discrete: bool = False) -> tuple[Mode, ...]:
+def unsteerable_modes(
+    A: Array, B: Array, *, discrete: bool = False, period: float | None = None
+) -> tuple[Mode, ...]:
     """Modes that no input moves, by the test of Popov, Belevitch and Hautus: rank (A - p I, B) < n.
 
     Repeated poles that rounding splits are judged as one: the test uses every pole with a tolerance.
@@ -64,13 +69,15 @@ def unsteerable_modes(A: Array, B: Array, *, discrete: bool = False) -> tuple[Mo
     for pole in linalg.eigvals(A):
         block = np.hstack([A - pole * np.eye(n), unit])
         if np.linalg.svd(block, compute_uv=False)[-1] <= _RANK * scale:
-            found.append(_mode(complex(pole), discrete=discrete))
+            found.append(_mode(complex(pole), discrete=discrete or period is not None, period=period))
     return tuple(found)
 
 
-def hidden_modes(A: Array, C: Array, *, discrete: bool = False) -> tuple[Mode, ...]:
+def hidden_modes(
+    A: Array, C: Array, *, discrete: bool = False, period: float | None = None
+) -> tuple[Mode, ...]:
     """Modes that no output C x shows: the unsteerable ones of the dual system."""
-    return unsteerable_modes(A.T, C.T, discrete=discrete)
+    return unsteerable_modes(A.T, C.T, discrete=discrete, period=period)
 
 
 @dataclass(frozen=True)
@@ -87,27 +94,27 @@ class Verdict:
 
 def controllability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode."""
-    stuck = unsteerable_modes(system.A, system.B, discrete=system.period is not None)
+    stuck = unsteerable_modes(system.A, system.B, period=system.period)
     by = ", ".join(system.inputs)
     return _verdict("controllable", f" by {by}", stuck, f"not controllable by {by}: they cannot move ")
 
 
 def stabilisability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode that does not die out by itself."""
-    stuck = unsteerable_modes(system.A, system.B, discrete=system.period is not None)
+    stuck = unsteerable_modes(system.A, system.B, period=system.period)
     more = ": what no input moves dies out" if stuck else ""
     return _verdict("stabilisable", more, _lasting(stuck), "not stabilisable: no input moves ")
 
 
 def observability(system: LinearSystem, C: ArrayLike) -> Verdict:
     """Whether outputs C x (o, n) show every mode."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), discrete=system.period is not None)
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period)
     return _verdict("observable", "", unseen, "not observable: nothing measured shows ")
 
 
 def detectability(system: LinearSystem, C: ArrayLike) -> Verdict:
     """Whether outputs C x (o, n) show every mode that does not die out by itself."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), discrete=system.period is not None)
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period)
     more = ": what nothing shows dies out" if unseen else ""
     return _verdict("detectable", more, _lasting(unseen), "not detectable: nothing measured shows ")
 
@@ -119,7 +126,8 @@ def _lasting(modes: tuple[Mode, ...]) -> tuple[Mode, ...]:
 def _verdict(word: str, more: str, failing: tuple[Mode, ...], otherwise: str) -> Verdict:
     if not failing:
         return Verdict(True, (), f"{word}{more}")
-    return Verdict(False, failing, otherwise + ", ".join(map(str, failing)))
+    shown = [mode for mode in failing if mode.pole.imag >= 0.0]  # one of each pair
+    return Verdict(False, failing, otherwise + ", ".join(map(str, shown)))
 
 
 def closed_loop(system: LinearSystem, K: ArrayLike) -> LinearSystem:
