@@ -41,10 +41,10 @@ class Raced(NamedTuple):
 
 
 def race_loop(chain: Chain, lanes: int) -> str:
-    """IR of `void race(i64 k, seeds, targets, table, i64 rows, i64 limit, i64 most, q, iterations, starts)`.
+    """IR of `void race(i64 k, seeds, targets, table, i64 rows, i64 limit, i64 most, q, counts)`.
 
     Over k targets; for each at most `limit` rows of the table, from its start again after its end, and `most`
-    iterations. `iterations` gets the count, negative when the target was not met.
+    iterations. `counts` (2, k) gets that of iterations, negative when the target was not met, and of rows.
     """
     e = Emitter(lanes)
     n = chain.n
@@ -67,16 +67,15 @@ def race_loop(chain: Chain, lanes: int) -> str:
             has = e.emit(f"icmp slt i64 {lane - 1}, %limit")
             row = e.element("%table", (lane - 1) * n, "double")
             _fill(e, e.emit(f"select i1 {has}, ptr {row}, ptr {seed}"), Q, lane, n)
-            with e.when(e.emit(f"xor i1 {has}, true")):
-                _rest(e, lane, BEST, STALL)
+        with e.when(few), e.loop(lanes) as lane, e.when(e.emit(f"icmp sgt i64 {lane}, %limit")):
+            _rest(e, lane, BEST, STALL)
         e.do(f"store i64 {first}, ptr {NEXT}")
         e.do(f"store i64 {e.emit(f'add nsw i64 {first}, 1')}, ptr {LIVE}")
         _until_met(e, lanes, n, (Q, N, T, ERR, BEST, STALL, NEXT, COUNT, LIVE), result)
-        for slot, name in ((COUNT, "%iterations"), (NEXT, "%starts")):
-            e.do(f"store i64 {e.emit(f'load i64, ptr {slot}')}, ptr {e.element(name, at, 'i64')}")
+        for slot, index in ((COUNT, at), (NEXT, e.emit(f"add nsw i64 {at}, %k"))):
+            e.do(f"store i64 {e.emit(f'load i64, ptr {slot}')}, ptr {e.element('%counts', index, 'i64')}")
     arguments = ["i64 %k", "ptr noalias %seeds", "ptr noalias %targets", "ptr noalias %table", "i64 %rows",
-                 "i64 %limit", "i64 %most", "ptr noalias %q", "ptr noalias %iterations",
-                 "ptr noalias %starts"]  # fmt: skip
+                 "i64 %limit", "i64 %most", "ptr noalias %q", "ptr noalias %counts"]  # fmt: skip
     return function("race", arguments, e)
 
 
@@ -199,14 +198,16 @@ class Racer:
         targets[:, :9] = np.asarray(R, dtype=float).reshape(-1, 9)
         targets[:, 9:12], targets[:, 12:] = p, tolerance
         first = np.ascontiguousarray(np.broadcast_to(np.asarray(seeds, dtype=float), (k, self.chain.n)))
-        table = self.table if starts is None else np.ascontiguousarray(starts, dtype=float)
-        q, (iterations, taken) = np.empty((k, self.chain.n)), np.empty((2, k), dtype=np.int64)
+        table, limit = self.table, _ENDLESS
+        if starts is not None:
+            table = np.ascontiguousarray(starts, dtype=float)
+            limit = len(table)
+        q, counts = np.empty((k, self.chain.n)), np.empty((2, k), dtype=np.int64)
         self.call(
-            k, address(first), address(targets), address(table), max(len(table), 1),
-            _ENDLESS if starts is None else len(table), most, address(q),
-            iterations.__array_interface__["data"][0], taken.__array_interface__["data"][0],
+            k, address(first), address(targets), address(table), max(len(table), 1), limit, most, address(q),
+            counts.__array_interface__["data"][0],
         )  # fmt: skip
-        return Raced(q, iterations > 0, np.abs(iterations), taken)
+        return Raced(q, counts[0] > 0, np.abs(counts[0]), counts[1])
 
 
 @lru_cache(maxsize=1)
@@ -242,7 +243,7 @@ def racer(chain: Chain, *, seed: int = 0, cache: bool = True, lanes: int | None 
     key = key_of(chain.fingerprint(), _source(), str(lanes), repr((jit.host(), jit.llvm_version())))
     code = obtain("race", lanes, Cache(default_folder() if cache else None), key, make)
     p, i = ctypes.c_void_p, ctypes.c_int64
-    return Racer(chain, lanes, table, code.build, code.loaded.function("race", i, p, p, p, i, i, i, p, p, p))
+    return Racer(chain, lanes, table, code.build, code.loaded.function("race", i, p, p, p, i, i, i, p, p))
 
 
 def _ranges(chain: Chain) -> tuple[Array, Array]:
