@@ -207,3 +207,26 @@ def test_print_fault_matrix(capsys: pytest.CaptureFixture[str]) -> None:
         for (fault, phase, stop), row in TABLE.items():
             print(f"{fault:<17}{phase:<11}{stop:<5}| {row.splitlines()[0]}")
     assert set(TABLE) <= set(CASES)
+
+
+@pytest.mark.parametrize("stop", ["hold", "limp"])
+def test_a_pulled_cable_is_told_once_for_all_with_what_becomes_of_the_torque(stop: str) -> None:
+    outcome, bus, *_ = play(FaultPlan(cable=(CablePull(moment("stream", stop, None)),)), stop)
+    (told,) = outcome.unconfirmed
+    assert all(f"servo {s.id} " in told for s in bus.servos)
+    assert "its watchdog stops it in 0.1 s, its torque may stay on" in told
+    assert [s.get("torque_enable") for s in bus.servos] == [1, 1, 1]
+    assert outcome.stop == "left to the watchdogs: no servo confirmed anything"
+
+
+@pytest.mark.parametrize("stop", ["hold", "limp"])
+def test_a_servo_in_error_is_told_with_its_torque(stop: str) -> None:
+    """Overheating takes its torque; the others do as promised."""
+    plan = FaultPlan(servos=(ServoFault("overheating", VICTIM, moment("stream", stop, None)),))
+    outcome, bus, *_ = play(plan, stop)
+    assert outcome.unconfirmed == [
+        f"{VICTIM_LABEL}: reports a hardware error: overheating; its torque is off"
+    ]
+    assert f"but {VICTIM_LABEL}" in outcome.stop
+    others = int(stop == "hold")
+    assert [s.get("torque_enable") for s in bus.servos] == [others, 0, others]

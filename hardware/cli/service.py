@@ -151,7 +151,7 @@ def stop(
 ) -> None:
     """Stop a rig: hold where it is, or let it go. This is a word over a cable, no power cut."""
     from ..connect import connect
-    from ..mirror.contract import freeze, release
+    from ..mirror.contract import freeze, release, sentences
 
     loaded = load_rig(rig)
     driver, _ = connect(loaded, port=port)
@@ -165,7 +165,7 @@ def stop(
         failed = release(driver, loaded) if limp else freeze(driver, loaded, at_present=True)
     finally:
         driver.close()
-    for text in failed:
+    for text in sentences(loaded, failed):
         console.print(f"[red]{escape(text)}")
     if failed:
         console.print("[bold]cut the power if it still moves")

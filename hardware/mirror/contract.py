@@ -6,6 +6,7 @@ No servo gets torque before its goal is where it stands; every write here is ans
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -215,10 +216,11 @@ def torque_on(driver: Driver, rig: Rig) -> None:
             )
 
 
-def release(driver: Driver, rig: Rig) -> list[str]:
-    """Torque off, everywhere; what could not be confirmed, as sentences."""
-    for _ in range(2):  # the quickest word first: one packet to all, unanswered
-        driver.sync_write(rig.ids, "torque_enable", [0] * len(rig.ids))
+def release(driver: Driver, rig: Rig) -> dict[int, str]:
+    """Torque off, everywhere; by ID, what could not be confirmed."""
+    with suppress(BusError):
+        for _ in range(2):  # the quickest word first: one packet to all, unanswered
+            driver.sync_write(rig.ids, "torque_enable", [0] * len(rig.ids))
 
     def let_go(id: int) -> None:
         driver.write_raw(id, "torque_enable", 0)
@@ -226,8 +228,8 @@ def release(driver: Driver, rig: Rig) -> list[str]:
     return _each(driver, rig, "let go", let_go, torque=0)
 
 
-def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> list[str]:
-    """Hold: goal := present (or keep the goal), watchdog off, torque on; what could not be confirmed.
+def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> dict[int, str]:
+    """Hold: goal := present (or keep the goal), watchdog off, torque on; by ID, what could not be confirmed.
 
     A servo that cannot be reached keeps its watchdog, which stops it.
     """
@@ -235,7 +237,7 @@ def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> list[str]:
     def hold(id: int) -> None:
         if driver.read_raw(id, "bus_watchdog") < 0:
             # clearing a tripped one could start an old goal
-            raise RigFault("stop", "its bus watchdog tripped, so it stands already", servo=id)
+            raise RigFault("stop", _TRIPPED, servo=id)
         if at_present:
             driver.write_raw(id, "goal_position", driver.read_raw(id, "present_position"))
         driver.write_raw(id, "bus_watchdog", 0)
@@ -243,29 +245,44 @@ def freeze(driver: Driver, rig: Rig, *, at_present: bool) -> list[str]:
     return _each(driver, rig, "hold", hold, torque=1)
 
 
-def _each(driver: Driver, rig: Rig, what: str, act: Callable[[int], None], *, torque: int) -> list[str]:
+_TRIPPED = "stands already, since its bus watchdog tripped; its torque stays on"
+
+
+def _each(driver: Driver, rig: Rig, what: str, act: Callable[[int], None], *, torque: int) -> dict[int, str]:
     """Do it to every servo, then look at every servo again: torque as wanted, no error."""
 
     def look(id: int) -> None:
-        if error := driver.read_raw(id, "hardware_error_status"):
-            raise RigFault("stop", f"it reports a hardware error: {error_names(error)}", servo=id)
-        if driver.read_raw(id, "torque_enable") != torque:
-            raise RigFault("stop", f"its torque is {'off' if torque else 'still on'}", servo=id)
+        error, now = (driver.read_raw(id, n) for n in ("hardware_error_status", "torque_enable"))
+        state = f"its torque is {'on' if now else 'off'}"
+        if error:
+            raise RigFault("stop", f"reports a hardware error: {error_names(error)}; {state}", servo=id)
+        if now != torque:
+            raise RigFault("stop", f"did not {what}: {state}", servo=id)
         if torque and driver.read_raw(id, "bus_watchdog") < 0:
-            raise RigFault("stop", "its bus watchdog tripped, so it stands already", servo=id)
+            raise RigFault("stop", _TRIPPED, servo=id)
 
     failed: dict[int, str] = {}
+    left = f"its watchdog stops it in {rig.watchdog:g} s, its torque may stay on"
     for step in (act, look):
         for id in rig.ids:
             if id in failed:
                 continue
-            label = rig.label(id)
             try:
                 step(id)
-            except (Refused, RigFault) as e:
-                failed[id] = f"{label} did not {what}: {e}"
+            except RigFault as e:
+                failed[id] = str(e)
+            except Refused as e:
+                failed[id] = f"did not {what}: {e}"
             except NoAnswer:
-                failed[id] = f"{label} did not confirm to {what}; its watchdog stops it in {rig.watchdog:g} s"
+                failed[id] = f"did not confirm to {what}; {left}"
             except BusError as e:
-                failed[id] = f"{label} is out of reach ({e}); its watchdog stops it in {rig.watchdog:g} s"
-    return list(failed.values())
+                failed[id] = f"is out of reach ({e}); {left}"
+    return failed
+
+
+def sentences(rig: Rig, failed: dict[int, str]) -> list[str]:
+    """What could not be confirmed, in words: those with the same trouble together."""
+    together: dict[str, list[int]] = {}
+    for id, trouble in failed.items():
+        together.setdefault(trouble, []).append(id)
+    return [f"{', '.join(map(rig.label, ids))}: {trouble}" for trouble, ids in together.items()]

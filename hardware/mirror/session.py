@@ -13,7 +13,7 @@ from ..driver import Driver, NoAnswer, Refused
 from ..errors import BusError, SourceFault
 from ..mapping import Mapping, joint_bounds, make_bounds, make_mapping, park_pose, within_joints
 from ..rig import Rig, RigError, Stop
-from .contract import Phase, Ready, RigFault, freeze, prepare, release, scan, torque_on
+from .contract import Phase, Ready, RigFault, freeze, prepare, release, scan, sentences, torque_on
 from .loop import Log, Loop
 
 Array = NDArray[np.float64]
@@ -173,9 +173,7 @@ class Session:
         if how == "park":
             how = self._park() if sound else "hold"
             if not sound:
-                out.unconfirmed.append(
-                    "not parked: a rig with a faulty servo does not move, it holds instead"
-                )
+                out.unconfirmed.append("not parked: after a fault of the rig nothing moves; it holds instead")
         for _ in range(2):  # a second Ctrl-C does not prevent a stop
             try:
                 self._end(how)
@@ -187,20 +185,17 @@ class Session:
 
     def _end(self, how: Stop) -> None:
         out, driver, rig = self.outcome, self.driver, self.rig
-        try:
-            if how == "hold":
-                failed = freeze(driver, rig, at_present=out.status != "done")
-                out.stop = "holds its pose; torque stays on and warms it until 'pantograph servo stop'"
-            else:
-                failed = release(driver, rig)
-                out.stop = "parked, then limp" if how == "park" else "limp: torque is off"
-            out.unconfirmed += failed
-            if len(failed) == len(rig.ids):
-                out.stop = "left to the watchdogs: no servo confirmed anything"
-        except BusError as e:
-            everyone = "; ".join(rig.label(i) for i in rig.ids)
-            out.unconfirmed.append(f"{e}; watchdogs stop after {rig.watchdog:g} s: {everyone}")
-            out.stop = "left to the watchdogs"
+        if how == "hold":
+            failed = freeze(driver, rig, at_present=out.status != "done")
+            out.stop = "holds its pose; torque stays on and warms it until 'pantograph servo stop'"
+        else:
+            failed = release(driver, rig)
+            out.stop = "parked, then limp" if how == "park" else "limp: torque is off"
+        out.unconfirmed += sentences(rig, failed)
+        if len(failed) == len(rig.ids):
+            out.stop = "left to the watchdogs: no servo confirmed anything"
+        elif failed:
+            out.stop += "; but " + ", ".join(map(rig.label, failed)) + ": see below"
 
     def _park(self) -> Stop:
         """Move to the park pose; 'hold' instead when that fails or is interrupted."""
