@@ -15,6 +15,8 @@ from pantograph.sim.ik import (
     JointValue,
     LookAt,
     Orientation,
+    PointOnLine,
+    PointOnPlane,
     Pose,
     Position,
     Posture,
@@ -88,6 +90,8 @@ def test_no_more_restarts_are_made_than_are_asked_for_and_all_are_counted(restar
         model, Position("tip", ik_cases.pose_of(model, [0.1] * 6, "tip")[0]), restarts=restarts, all=True
     )
     assert listed.restarts == restarts
+    model, goals = _hard_pose(3)
+    assert solve(model, goals, restarts=restarts, all=True, q0=model.jnt_range[:, 0]).restarts <= restarts
 
 
 def test_numbers_of_restarts_and_seeds_are_whole_and_not_negative():
@@ -289,6 +293,22 @@ def test_what_makes_no_goal_is_told_at_once():
     ):
         with pytest.raises(ModelError, match=words):
             wrong()
+
+
+def test_goals_whose_rows_depend_on_each_other_are_judged():
+    """Three slides: a line, a plane through it, and a distance that misses the line, or does not."""
+    model = ik_cases.chain(
+        [*(([0, 0, 0], ik_cases.SLIDE, e, (-3, 3)) for e in np.eye(3)), ([0, 0, 0], *[None] * 3)]
+    )
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        p, u, n = rng.uniform(-0.5, 0.5, 3), ik_cases.unit(rng), ik_cases.unit(rng)
+        n -= (n @ u) * u
+        n /= np.linalg.norm(n)
+        center = p + 0.4 * n + rng.normal() * u
+        for distance, kind in ((0.5, "solved"), (0.3, "conflict")):
+            goals = [PointOnLine("tip", p, u), PointOnPlane("tip", p, n), Distance("tip", center, distance)]
+            assert solve(model, goals, restarts=20).verdict.kind == kind
 
 
 def test_a_model_without_joints_and_the_world_itself_are_judged():

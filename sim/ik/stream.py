@@ -15,17 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ModelError
-from .collision import Clearance
+from .collision import Clearance, Gap
 from .goals import Goal
 from .numeric.qp import minimise
-from .pose import Kinematics
 from .problem import Problem, freedom_names
+from .series import Series
 from .solve import residuals
 from .space import Space
 from .verdict import Residual
@@ -33,7 +34,7 @@ from .verdict import Residual
 Array = NDArray[np.float64]
 _HARD = 1e6  # weight of hard goals and loops over wishes of weight 1
 _LEAST = 1e-8  # damping; it grows where steps do not help, before goals that cannot be met
-_CLOSE = 1e-20
+_CLOSE, _GAIN = 1e-20, 1e-6  # a cost, and a relative change of it, that need no further linearisation
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 4  # linearisations a tick
@@ -58,6 +59,16 @@ class Tick:
     residuals: tuple[Residual, ...]
     followed: bool
     held: tuple[str, ...]
+
+
+class _Point(NamedTuple):
+    """A configuration (nq,): rows as the programme weighs them, distances of geoms, and what it costs."""
+
+    q: Array
+    r: Array
+    J: Array
+    gaps: list[Gap]
+    cost: float
 
 
 class Follower:
@@ -88,8 +99,9 @@ class Follower:
     ):
         if not (np.isfinite(dt) and dt > 0):
             raise ModelError(f"a tick lasts a positive time, not {dt} s")
-        self.model, self.dt, self.joints = model, dt, joints
-        self.space, self.kinematics = Space(model), Kinematics(model)
+        self.model, self.dt = model, dt
+        self.space = Space(model)
+        self.series = Series(model, self.space, joints)
         self.q = self.space.check(model.qpos0 if q0 is None else q0)
         self.v: Array = np.zeros(model.nv)
         self._damping = _LEAST
@@ -105,49 +117,49 @@ class Follower:
         self.apart = Clearance(model, apart, reach=10 * clearance + 0.1) if apart else None
         self.names = [f"{a} near {b}" for a, b in apart]
 
+    def compile(self, goals: Sequence[Goal]) -> bool:
+        """Prepare ticks with goals like these in machine code: ahead of a loop, for it takes a second unless
+        it was done before. Without it, and where it returns False, NumPy does the same several times slower.
+        """
+        return self.series.compile(goals)
+
     def step(self, goals: Sequence[Goal]) -> Tick:
         """Move one tick towards `goals`."""
-        problem = Problem(self.model, goals, self.space, joints=self.joints, kinematics=self.kinematics)
+        problem = self.series.problem(goals)
         columns = np.flatnonzero(problem.moved)
         before, low, high = self.q, *self._box()
         low, high = self._braked(problem, low, high)
-        d: Array = np.zeros(self.model.nv)
         allowed = self._allowed()
-        d = np.clip(d, low, high)
-        self.q = self.space.step(before[None], d[None])[0]
-        best, held = self._cost(problem, self.q, allowed), tuple[str, ...]()
+        d = np.clip(np.zeros(self.model.nv), low, high)
+        here, held = self._at(problem, self.space.step(before[None], d[None])[0], allowed), tuple[str, ...]()
         for _ in range(_ITERATIONS):
-            trial, why = self._programme(problem, columns, d, low, high, allowed)
-            q = self.space.step(before[None], trial[None])[0]
-            cost = self._cost(problem, q, allowed)
-            better = cost < best
+            trial, why = self._programme(here, columns, d, low, high, allowed)
+            there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
+            better = there.cost < here.cost
             self._damping = min(max(self._damping * (0.03 if better else 30.0), _LEAST), 1.0)
             held = why if better or not held else held
             if better:
-                self.q, d, best = q, trial, cost
-                if cost < _CLOSE:
+                gain, here, d = here.cost - there.cost, there, trial
+                if here.cost < _CLOSE or gain < _GAIN * here.cost:
                     break
-            else:
-                self.q = self.space.step(before[None], d[None])[0]
-        after = problem.raw(self.q[None]).r
+        self.q = here.q
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
-        met = bool(problem.met(after)[0])
+        met = bool(problem.met(problem.raw(self.q[None]).r)[0])
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
 
-    def _cost(self, problem: Problem, q: Array, allowed: list[float]) -> float:
-        """Squared residuals at q (nq,), walls that are passed counted most."""
-        w = problem.weighted(problem.raw(q[None])).r[0]
-        passed = 0.0
-        if self.apart is not None:
-            gaps = self.apart.gaps(q)
-            passed = max(
-                (least - gap.distance for gap, least in zip(gaps, allowed, strict=True)), default=0.0
-            )
-        return float(w @ (w * np.where(problem.judged, 1.0, 1.0 / _HARD))) + 1e3 * max(0.0, passed)
+    def _at(self, problem: Problem, q: Array, allowed: list[float]) -> _Point:
+        """The goals' rows and the geoms' distances at q (nq,); walls that are passed cost most."""
+        w = problem.weighted(problem.raw(q[None]))
+        gaps = [] if self.apart is None else self.apart.gaps(q)
+        passed = max((least - gap.distance for gap, least in zip(gaps, allowed, strict=True)), default=0.0)
+        r, J = w.r[0], w.J[0]
+        cost = float(r @ (r * np.where(problem.judged, 1.0, 1.0 / _HARD))) + 1e3 * max(0.0, passed)
+        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
+        return _Point(q, r * weight, J * weight[:, None], gaps, cost)
 
     def _programme(
         self,
-        problem: Problem,
+        here: _Point,
         columns: NDArray[np.intp],
         d: Array,
         low: Array,
@@ -155,16 +167,14 @@ class Follower:
         allowed: list[float],
     ) -> tuple[Array, tuple[str, ...]]:
         """Step (nv,) better than `d`, by the quadratic programme at q + d, and what holds it."""
-        w = problem.weighted(problem.raw(self.q[None]))
-        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
-        r, J = w.r[0] * weight, w.J[0][:, columns] * weight[:, None]
-        A, b, names = self._walls(columns, allowed)
+        J = here.J[:, columns]
+        A, b, names = self._walls(here, columns, allowed)
         n, k = len(columns), len(b)
         H = np.zeros((n + k, n + k))
         damping = self._damping * _HARD
         H[:n, :n] = J.T @ J + damping * np.eye(n)
         H[n:, n:] = _SLACK * np.eye(k)
-        g = np.concatenate([J.T @ r, np.full(k, _PENALTY)])
+        g = np.concatenate([J.T @ here.r, np.full(k, _PENALTY)])
         eye = np.eye(n + k)
         rows = np.concatenate([eye[:n], -eye[:n], np.concatenate([A, -np.eye(k)], axis=1), -eye[n:]])
         room = np.concatenate([(high - d)[columns], (d - low)[columns], b, np.zeros(k)])
@@ -243,12 +253,11 @@ class Follower:
         spare = [gap.distance - self.clearance for gap in self.apart.gaps(self.q)]
         return [self.clearance + (1 - _SHARE) * x for x in spare]
 
-    def _walls(self, columns: NDArray[np.intp], allowed: list[float]) -> tuple[Array, Array, list[str]]:
-        """Rows A d <= b that keep geoms apart, for pairs near enough to matter, at the present q."""
-        if self.apart is None:
-            return np.zeros((0, len(columns))), np.zeros(0), []
-        every = zip(self.apart.gaps(self.q), allowed, self.names, strict=True)
-        near = [(gap, least, name) for gap, least, name in every if np.any(gap.J)]
+    def _walls(
+        self, here: _Point, columns: NDArray[np.intp], allowed: list[float]
+    ) -> tuple[Array, Array, list[str]]:
+        """Rows A d <= b that keep geoms apart, for pairs near enough to matter."""
+        near = [x for x in zip(here.gaps, allowed, self.names, strict=False) if np.any(x[0].J)]
         A = np.array([-gap.J[columns] for gap, _, _ in near]).reshape(-1, len(columns))
         b = np.array([gap.distance - least for gap, least, _ in near])
         return A, b, [name for _, _, name in near]

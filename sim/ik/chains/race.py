@@ -67,8 +67,8 @@ def race_loop(chain: Chain, lanes: int) -> str:
             has = e.emit(f"icmp slt i64 {lane - 1}, %limit")
             row = e.element("%table", (lane - 1) * n, "double")
             _fill(e, e.emit(f"select i1 {has}, ptr {row}, ptr {seed}"), Q, lane, n)
-        with e.when(few), e.loop(lanes) as lane, e.when(e.emit(f"icmp sgt i64 {lane}, %limit")):
-            _rest(e, lane, BEST, STALL)
+        with e.when(few), e.loop(lanes) as i, e.when(e.emit(f"icmp sgt i64 {i}, %limit")):
+            _rest(e, i, BEST, STALL)
         e.do(f"store i64 {first}, ptr {NEXT}")
         e.do(f"store i64 {e.emit(f'add nsw i64 {first}, 1')}, ptr {LIVE}")
         _until_met(e, lanes, n, (Q, N, T, ERR, BEST, STALL, NEXT, COUNT, LIVE), result)

@@ -111,12 +111,21 @@ def _steps(problem: Problem, q: Array, w: Rows, damping: Array) -> Array:
     JT = J.transpose(0, 2, 1)
     if m <= nv:
         A = J @ JT + damping[:, None, None] * np.eye(m)
-        d[:, columns] = -(JT @ np.linalg.solve(A, w.r[:, :, None]))[:, :, 0]
+        d[:, columns] = -(JT @ solved(A, w.r[:, :, None]))[:, :, 0]
     else:
         A = JT @ J + damping[:, None, None] * np.eye(nv)
-        d[:, columns] = -np.linalg.solve(A, JT @ w.r[:, :, None])[:, :, 0]
+        d[:, columns] = -solved(A, JT @ w.r[:, :, None])[:, :, 0]
     longest = np.abs(d).max(axis=1, initial=0.0)
     return np.asarray(d * np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None])
+
+
+def solved(A: Array, b: Array) -> Array:
+    """A^-1 b for semidefinite A (..., k, k), a little more than that where rounding leaves it singular."""
+    try:
+        return np.asarray(np.linalg.solve(A, b))
+    except np.linalg.LinAlgError:
+        more = 1e-12 * np.trace(A, axis1=-2, axis2=-1)[..., None, None] + 1e-300
+        return np.asarray(np.linalg.solve(A + more * np.eye(A.shape[-1]), b))
 
 
 def tighten(problem: Problem, q: Array, *, steps: int = 4) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..goals import Rows
 from ..problem import Problem
 from ..space import Space
-from .descend import Descent, descend, held_projection
+from .descend import Descent, descend, held_projection, solved
 from .search import Search
 from .settle import Wish, settle
 
@@ -108,7 +108,7 @@ def _newton(problem: Problem, q: Array, rows: Wish, wish: Wish | None, iteration
         for _ in range(12):
             A = H + (max(0.0, -least) * 1.1 + shift) * np.eye(len(free))
             d = np.zeros(space.nv)
-            d[free] = -np.linalg.solve(A, down)
+            d[free] = -solved(A, down[:, None])[:, 0]
             d *= min(1.0, 0.5 / max(np.abs(d).max(), 1e-300))
             trial = space.step(x, d[None])
             w_trial, k_trial = rows(trial), None if wish is None else wish(trial)
