@@ -80,8 +80,17 @@ def rotate(q: ArrayLike, x: ArrayLike) -> Array:
 
 def to_matrix(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3)."""
-    q = np.asarray(q, dtype=float)
-    return np.stack([rotate(q, e) for e in np.eye(3)], axis=-1)
+    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    out = np.empty((*w.shape, 3, 3))
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            out[..., i, j] = entry
+    return out
 
 
 def from_matrix(R: ArrayLike) -> Array:

@@ -87,6 +87,7 @@ class Live:
             joints=names,
         )
         self.follower.v = self.v
+        self.follower.compile(self.goals(0.0))
         self.seen: tuple[float, Array] | None = None  # time and velocity of the run at the last tick
         self.tick = Target(q0, self.v, np.zeros(model.nv))  # the curve where the present tick began
 
