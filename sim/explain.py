@@ -63,9 +63,17 @@ def other_physics(problem: Problem, engine: str) -> list[str]:
     """Where the engine's physics, not its accuracy, differs from MuJoCo's."""
     if engine != "smooth":
         return []
+    from .engines.limits import limits_of
     from .engines.smooth import differences
 
-    return [f"otherwise than MuJoCo: {line}" for line in differences(problem)]
+    out = [f"otherwise than MuJoCo: {line}" for line in differences(problem)]
+    for limit in limits_of(problem).each:
+        beyond = -limit.gap(problem.state0.q)
+        if beyond > 1e-9:
+            name = name_of(problem.model, "joint", limit.joint)
+            unit = "m" if problem.model.jnt_type[limit.joint] == SLIDE else "rad"
+            out.append(f"joint {name!r} starts {beyond:.3g} {unit} beyond its limit: it is put on it at once")
+    return out
 
 
 def cheaper(needs: Needs, engine: str, integrator: str) -> list[str]:

@@ -15,6 +15,7 @@ from .kinds import SCALAR
 from .scene.build import Setup
 
 _DEFAULT_PERIOD = 0.002  # s; period of the controller of tracked joints when the scene names none
+_STIFF = 1.75  # rate times step; RK4 is stable up to 2.78, of which smoothed dry friction may take 1
 _LOOKS = 5  # moments of the keys at which springs and servos are looked at
 
 
@@ -89,9 +90,13 @@ class Needs:
         if limited := unlocated(m, keyed=keyed):
             reasons.append(f"{'; '.join(limited)} (physics.limits = false leaves them out)")
         h = float(m.opt.timestep) if solver.step == "auto" else solver.step
-        if self.fastest * h > 1.0 and solver.tolerance is None:
+        if self.is_stiff(h) and solver.tolerance is None:
             reasons.append(f"{self.stiff} are stiff for an explicit method at a step of {h:g} s")
         return reasons + unsupported(m, keyed=keyed)
+
+    def is_stiff(self, step: float) -> bool:
+        """Whether springs, dampers and servos are too fast for RK4 at a step [s]."""
+        return self.fastest * step > _STIFF
 
     @property
     def stiff(self) -> str:

@@ -269,7 +269,7 @@ def _integrator(needs: Needs, engine: str, h: float) -> Choice:
         return Choice(solver.integrator, "the scene asks for it")
     if solver.tolerance is not None:
         return Choice("dopri5", f"adaptive, to a relative tolerance of {solver.tolerance:g}")
-    if needs.fastest * h > 1.0:
+    if needs.is_stiff(h):
         return Choice("discrete", f"{needs.stiff} are stiff for a step of {h:g} s")
     if needs.touch:
         return Choice("rk4", "nothing is stiff; order 4 between contacts, 1 where they begin and end")

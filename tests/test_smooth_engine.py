@@ -229,6 +229,31 @@ def test_an_impact_keeps_the_angular_momentum_of_a_floating_pair(tmp_path):
     assert np.all(np.abs(r.q[:, -1]) <= 0.4 + 1e-12)
 
 
+def test_engines_agree_on_the_force_of_a_keyed_joint_with_an_actuator_of_its_own(tmp_path):
+    """Inverse dynamics asks for it, whoever gives which part: m (a + g), of which the motor gives 3 N."""
+    keys = [
+        {"joint": "z", "times": [0, 0.5, 1], "values": [0, 0.4, 0]},
+        {"actuator": "push", "times": [0], "values": [3]},
+    ]
+    for solver in ({"engine": "smooth"}, {"engine": "contact", "integrator": "rk4"}):
+        xml = SLIDE.replace(
+            "</worldbody>",
+            '<body><joint name="y"/><geom size=".1" contype="0" conaffinity="0"/></body></worldbody>',
+        )
+        r = run(scene_of(tmp_path, xml, duration=1.0, keys=keys, solver=solver))
+        np.testing.assert_allclose(r.tau[:, 0], 2 * (r.a[:, 0] + G), atol=1e-5)
+
+
+def test_a_joint_that_starts_beyond_its_limit_is_put_on_it_and_told(tmp_path):
+    start = {"position": {"z": -0.6}}
+    plan = make_plan(scene_of(tmp_path, SLIDE, duration=0.1, initial=start))
+    assert any("'z' starts 0.1 m beyond its limit: it is put on it" in line for line in plan.left_out)
+    r = run(plan)
+    assert np.all(r.q[1:, 0] == -0.5) and [(e.t, e.kind) for e in r.events] == [(0.0, "limit")]
+    inside = make_plan(scene_of(tmp_path, SLIDE, duration=0.1))
+    assert not any("beyond its limit" in line for line in inside.left_out)
+
+
 def test_dry_friction_stops_a_sliding_joint_where_coulomb_says(tmp_path):
     """m = 2 kg, friction 3 N, 1.5 m/s: it stops after v^2 m / (2 F) = 0.75 m, in v m / F = 1 s."""
     xml = SLIDE.replace('range="-0.5 2" limited="true"', 'frictionloss="3"').replace("0 0 -9.81", "0 0 0")

@@ -17,8 +17,8 @@ from .timed import Timed
 class Derived:
     """Quantities that belong to the recorded states, not to the step before (n samples).
 
-    a (n, nv); tau (n, nv): force of actuators, controllers and, on keyed joints, the force that a drive
-    needs for the keyed motion [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,): sum of
+    a (n, nv); tau (n, nv): force of actuators, controllers and, on keyed joints, of whatever drives them as
+    keyed, their actuators included [N, N m]; ctrl (n, nu); kinetic, potential (n,) [J]; normal (n,): sum of
     contact normal forces [N].
     """
 
@@ -62,7 +62,7 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
             apply_wrenches(p.model, d, timed, inputs.wrench[i])
             p.settle(d, qfrc, inputs.a[i])
             a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
-            tau[i, p.keyed] = p.drive + friction * np.sign(segment.v[i, p.keyed])
+            tau[i, p.keyed] = d.qfrc_actuator[p.keyed] + p.drive + friction * np.sign(segment.v[i, p.keyed])
             normal[i] = _normal(p.model, d)
         kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
     return Derived(a, tau, ctrl, kinetic, potential, normal)

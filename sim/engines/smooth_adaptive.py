@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -99,13 +98,13 @@ class AdaptiveRun(Run):
 
         c = self.model()
         if id(c) not in self.followers:
-            begun, tolerance = time.perf_counter(), self.problem.tolerance
+            tolerance = self.problem.tolerance
             assert tolerance is not None
-            motion = c.polynomials(self.end)
-            self.followers[id(c)] = Follower(
-                c.smooth, self.method, motion, self.records, tolerance, c.guards(self.limits)
-            )
-            self.build_s += time.perf_counter() - begun
+            with self.preparing():
+                motion = c.polynomials(self.end)
+                self.followers[id(c)] = Follower(
+                    c.smooth, self.method, motion, self.records, tolerance, c.guards(self.limits)
+                )
         return self.followers[id(c)]
 
     @property

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from ..integrate import Tableau
 
 
+_FEW = 16
+
+
 class FixedRun(Run):
     """A run on a grid of steps; the state is at the start of step ``k``."""
 
@@ -27,6 +30,7 @@ class FixedRun(Run):
         super().__init__(problem, t_span, controls, method)
         self.per_tick = steps_per_tick(controls, self.h)
         self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
+        self.most = CHUNK  # steps at once: few after an event, which another may follow
 
     def advance(self, progress: Callable[[float], None] | None) -> str:
         """See `Run`."""
@@ -49,7 +53,7 @@ class FixedRun(Run):
                 progress(self.t0 + k * self.h)
 
     def _until_next(self, k: int) -> int:
-        stops = [self.steps - k, CHUNK]
+        stops = [self.steps - k, self.most]
         if self.per_tick:
             stops.append(self.per_tick - k % self.per_tick)
         stops += [at - k for at in self.jumps if at > k]
@@ -74,7 +78,9 @@ class FixedRun(Run):
                 self.keep((k + i) * self.h, q[i], v[i], act[i])
         self.q, self.v, self.act = q[last].copy(), v[last].copy(), act[last].copy()
         if last == n:
+            self.most = min(CHUNK, 2 * self.most)
             return k + n
+        self.most = _FEW
         self.offset = (k + last) * self.h
         if (k + last) % self.problem.sample_every == 0:
             self.keep(self.offset, self.q, self.v, self.act)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,6 +68,9 @@ class Run(ABC):
         """Run to the end, or as far as it goes."""
         started, status, message, failure = time.perf_counter(), "done", "", None
         try:
+            if self.limits.each:
+                with self.preparing():
+                    import scipy.optimize  # noqa: F401  # takes its time when it is needed first
             message = self.advance(progress)
             status = "diverged" if message else "done"
         except KeyboardInterrupt:
@@ -108,12 +112,24 @@ class Run(ABC):
         """The compiled model, with the joints that rest at a limit taken out of the unknowns."""
         resting = self.resting if resting is None else resting
         if resting not in self.compiled:
-            begun = time.perf_counter()
-            self.compiled[resting] = Compiled(
-                self.problem, self.timed, self.t0, self.method, width=self.width, resting=resting
-            )
-            self.build_s += time.perf_counter() - begun
+            with self.preparing():
+                self.compiled[resting] = Compiled(
+                    self.problem, self.timed, self.t0, self.method, width=self.width, resting=resting
+                )
         return self.compiled[resting]
+
+    @contextmanager
+    def preparing(self) -> Iterator[None]:
+        """Time that is no integration."""
+        begun = time.perf_counter()
+        yield
+        self.build_s += time.perf_counter() - begun
+
+    def compile(self, c: Compiled, *names: str, count: int = 1) -> None:
+        """Have functions of the compiled model for ``count`` states."""
+        with self.preparing():
+            for name in names:
+                c.smooth.program(name, 1 if count == 1 else c.smooth.lanes)
 
     def sample(self, k: int) -> None:
         """Sample the controller at its tick ``k``."""
@@ -218,6 +234,7 @@ class Run(ABC):
     def forces_at(self, offsets: Array, q: Array, v: Array, act: Array) -> Array:
         """Forces (n, resting) that the limits give at n states, and may just pull: see `slack`."""
         c = self.model()
+        self.compile(c, "drive", count=len(q))
         drive = c.smooth.drive(q[:, c.q_free], v[:, c.v_free], c.held(self.held), act=act, w=c.at(offsets))
         at = [int(np.flatnonzero(c.v_keyed == limit.dof)[0]) for limit in self.resting]
         sides = np.array([limit.side for limit in self.resting], dtype=float)
@@ -243,6 +260,7 @@ class Run(ABC):
             if gap <= TOUCHING or limit is hit
         ]
         c = self.model(())
+        self.compile(c, "mass_matrix", "forward")
         side = -np.array([limit.side for limit in at], dtype=float)
         dof = np.array([int(np.flatnonzero(c.v_free == limit.dof)[0]) for limit in at])
         w = c.at(np.array([self.offset]))[0]
