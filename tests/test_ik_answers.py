@@ -297,17 +297,15 @@ def test_what_makes_no_goal_is_told_at_once():
 
 def test_goals_whose_rows_depend_on_each_other_are_judged():
     """Three slides: a line, a plane through it, and a distance that misses the line, or does not."""
-    model = ik_cases.chain(
-        [*(([0, 0, 0], ik_cases.SLIDE, e, (-3, 3)) for e in np.eye(3)), ([0, 0, 0], *[None] * 3)]
-    )
-    for seed in range(12):
+    axes = [([0, 0, 0], ik_cases.SLIDE, e, (-3, 3)) for e in np.eye(3)]
+    model = ik_cases.chain([*axes, ([0, 0, 0], None, None, None)])
+    for seed in range(15):
         rng = np.random.default_rng(seed)
-        p, u, n = rng.uniform(-0.5, 0.5, 3), ik_cases.unit(rng), ik_cases.unit(rng)
-        n -= (n @ u) * u
-        n /= np.linalg.norm(n)
-        center = p + 0.4 * n + rng.normal() * u
-        for distance, kind in ((0.5, "solved"), (0.3, "conflict")):
-            goals = [PointOnLine("tip", p, u), PointOnPlane("tip", p, n), Distance("tip", center, distance)]
+        p, u, center = rng.uniform(-0.5, 0.5, 3), ik_cases.unit(rng), rng.uniform(-0.5, 0.5, 3)
+        far = np.linalg.norm(np.cross(center - p, u))
+        surfaces = [PointOnLine("tip", p, u), PointOnPlane("tip", p, np.cross(u, ik_cases.unit(rng)))]
+        for share, kind in ((0.5, "conflict"), (1.5, "solved")):
+            goals = [*surfaces, Distance("tip", center, share * far)]
             assert solve(model, goals, restarts=20).verdict.kind == kind
 
 
