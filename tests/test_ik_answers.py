@@ -304,9 +304,9 @@ def test_goals_whose_rows_depend_on_each_other_are_judged(monkeypatch):
         rng = np.random.default_rng(seed)
         p, u, center = rng.uniform(-0.5, 0.5, 3), ik_cases.unit(rng), rng.uniform(-0.5, 0.5, 3)
         far = np.linalg.norm(np.cross(center - p, u))
-        surfaces = [PointOnLine("tip", p, u), PointOnPlane("tip", p, np.cross(u, ik_cases.unit(rng)))]
+        line, plane = PointOnLine("tip", p, u), PointOnPlane("tip", p, np.cross(u, ik_cases.unit(rng)))
         for share, kind in ((0.5, "conflict"), (1.5, "solved")):
-            goals = [*surfaces, Distance("tip", center, share * far)]
+            goals = [line, Distance("tip", center, share * far), plane]
             assert solve(model, goals, restarts=20).verdict.kind == kind
 
 
