@@ -7,8 +7,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from .control import Replay
-from .engines.interface import Array, Engine, Problem, Segment
+from .engines.interface import Array, Controls, Engine, Problem, Segment
 from .errors import EngineError
 from .kinds import BALL, FREE, HINGE
 from .recording import ErrorEstimate
@@ -16,20 +15,23 @@ from .recording import ErrorEstimate
 _TIGHTEST = 1e-12  # tolerance that leaves room for a hundred times tighter run
 
 
-def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: float | None) -> ErrorEstimate:
+def estimate_error(
+    engine: Engine, problem: Problem, segment: Segment, controls: Controls | None
+) -> ErrorEstimate:
     """Error of ``segment`` by extrapolation: |x_h - x_h/2| 2^p / (2^p - 1) (Hairer, Norsett, Wanner,
-    Solving Ordinary Differential Equations I, II.4), with the same control samples at half the step.
+    Solving Ordinary Differential Equations I, II.4), p the order.
 
+    ``controls`` are those of the run, unused: the run at half the step is controlled anew, at the same
+    period. The run's own samples played back would tell nothing of what feedback makes of errors.
     Contacts and limits break the order p: from the first event of either run on, p = 1 is assumed, and
     ``trusted_until`` says when that begins. Infinite where the run at half the step has diverged.
     Raises KeyboardInterrupt when it was interrupted.
     """
-    replay = Replay(period, segment.tick_ctrl, segment.tick_qfrc) if period and len(segment.tick_t) else None
     if problem.tolerance is not None:
-        return _estimate_adaptive(engine, problem, segment, replay)
+        return _estimate_adaptive(engine, problem, segment, controls)
     half = dataclasses.replace(problem, step=problem.step / 2, sample_every=2 * problem.sample_every)
     span = (float(segment.t[0]), float(segment.t[-1]))
-    finer = engine.run(half, span, replay)
+    finer = engine.run(half, span, controls)
     if finer.status == "interrupted":
         raise KeyboardInterrupt
     n = min(len(finer.t), len(segment.t))
@@ -51,7 +53,7 @@ def estimate_error(engine: Engine, problem: Problem, segment: Segment, period: f
 
 
 def _estimate_adaptive(
-    engine: Engine, problem: Problem, segment: Segment, replay: Replay | None
+    engine: Engine, problem: Problem, segment: Segment, controls: Controls | None
 ) -> ErrorEstimate:
     """Difference to a run at a hundredth of the tolerance, whose own error is small beside it.
 
@@ -64,7 +66,7 @@ def _estimate_adaptive(
             f"below a tolerance of {_TIGHTEST:g} rounding leaves nothing tighter to compare with"
         )
     tighter = dataclasses.replace(problem, tolerance=problem.tolerance / 100)
-    finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), replay)
+    finer = engine.run(tighter, (float(segment.t[0]), float(segment.t[-1])), controls)
     if finer.status == "interrupted":
         raise KeyboardInterrupt
     n = min(len(finer.t), len(segment.t))

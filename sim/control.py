@@ -87,18 +87,6 @@ class Sampled:
         return Target(targets.q[i], targets.v[i], targets.a[i])
 
 
-class Replay:
-    """The recorded samples of a controller, played again: same inputs, whatever the state."""
-
-    def __init__(self, period: float, ctrl: Array, qfrc: Array) -> None:
-        self.period, self._ctrl, self._qfrc = period, ctrl, qfrc
-
-    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
-        """See :class:`~pantograph.sim.engines.interface.Controls`."""
-        k = min(k, len(self._ctrl) - 1)
-        return Held(self._ctrl[k], self._qfrc[k])
-
-
 @dataclass(frozen=True)
 class JointActuators:
     """The n actuators, each on one joint, that a controller drives, by MuJoCo's affine law:

@@ -64,7 +64,8 @@ def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
         missed = _missed(setup, segment)
         notes += _sentences(setup, missed, segment.t)
         if engine is not None and status == "done" and segment.stats["steps"]:
-            estimate = estimate_error(engine, problem, segment, plan.period)
+            controls = make_controls(setup.scene, problem, plan.period)
+            estimate = estimate_error(engine, problem, segment, controls)
     except EngineError as e:
         notes.append(f"no error estimate: {e}")
     except KeyboardInterrupt:

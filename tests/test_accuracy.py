@@ -96,10 +96,28 @@ def test_the_estimate_falls_at_the_order_of_the_integrator(step, seed):
         assert errors[0] / errors[1] == pytest.approx(fall, rel=0.2)
 
 
-def test_keyed_and_controlled_motion_has_an_estimate_with_the_same_inputs():
+def controlled(step, engine="auto", frequency=3.0, lean=0.2, duration=1.5):
+    """A shoulder that feedback alone holds upright, and an elbow that follows its keys."""
+    return Scene(
+        duration=duration,
+        rate=25,
+        models=[MODELS["double_pendulum"]],
+        physics=SMOOTH,
+        roles={"tracked": ["shoulder", "elbow"]},
+        initial={"position": {"shoulder": np.pi - lean}},
+        keys=[
+            {"joint": "shoulder", "times": [0], "values": [np.pi]},
+            {"joint": "elbow", "times": [0, duration], "values": [0.5, -0.5], "ease": "smooth"},
+        ],
+        controller={"period": 0.02, "frequency": frequency},
+        solver={"step": step, "engine": engine, "integrator": "rk4"},
+    )
+
+
+def test_keyed_and_controlled_motion_has_an_estimate_of_the_integrators_order():
     scene = {
         "duration": 1.0,
-        "models": [{"file": "double_pendulum"}],
+        "models": [MODELS["double_pendulum"]],
         "physics": SMOOTH,
         "roles": {"tracked": ["elbow"]},
         "keys": [
@@ -108,11 +126,20 @@ def test_keyed_and_controlled_motion_has_an_estimate_with_the_same_inputs():
         ],
         "controller": {"period": 0.02},
     }
-    r = run(Scene(**scene, solver={"step": 0.01}), error=True)
-    # sample and hold of a feedback: the same samples give a difference of integration only, of order 4
-    assert 0 < r.error.angle.max() < 1e-5
-    finer = run(Scene(**scene, solver={"step": 0.005}), error=True)
-    assert r.error.angle.max() / finer.error.angle.max() == pytest.approx(16, rel=0.5)
+    coarse, fine = (run(Scene(**scene, solver={"step": h}), error=True).error for h in (0.01, 0.005))
+    assert 0 < coarse.angle.max() < 1e-5
+    assert coarse.angle.max() / fine.angle.max() == pytest.approx(16, rel=0.5)
+
+
+@given(st.sampled_from(["smooth", "contact"]), st.floats(2.0, 5.0), st.floats(-0.3, 0.3))
+@settings(max_examples=8)
+def test_the_estimate_has_feedback_in_its_loop(engine, frequency, lean):
+    """Upright only by feedback: its samples played back would let any error fall over."""
+    r = run(controlled(0.02, engine, frequency, lean, duration=4.0), error=True)
+    truth = run(controlled(0.02 / 16, "contact", frequency, lean, duration=4.0))
+    error = difference(r.model, r.q, truth.q)[0].max()
+    assert r.error.angle.max() <= 1.2 * error + 1e-9
+    assert error <= 1.2 * r.error.angle.max() + 1e-9
 
 
 ball = {"name": "ball", "shape": "sphere", "size": [0.1]}
