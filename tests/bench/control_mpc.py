@@ -50,13 +50,12 @@ def run(console: Console, name: str, law: NMPC, x: np.ndarray, seconds: float) -
         ticks.append(time.perf_counter() - begun)
         if k % 10 == 5:
             ref = law.horizon(t)
-            guess = np.clip(law._shifted(before, t), law.low, law.high)
-            path = law.rollout(x, guess, ref)
+            guess = law.carried(x, ref, t, before)
             begun = time.perf_counter()
-            peer(x, ref, path, guess)
+            peer(x, ref, guess.x, guess.u)
             theirs.append(time.perf_counter() - begun)
-            best = law.improve(law.rollout(x, memory.u, ref), memory.u.copy(), ref, 200)[2]
-            ratios.append((memory.cost + 1e-6) / (best + 1e-6))
+            best = law.shooting.improve(memory.plan, ref, 200).cost
+            ratios.append((memory.plan.cost + 1e-6) / (best + 1e-6))
         q, v = advance(law.nominal, q[None], v[None], tau[None], period / 4, 4)
         x = np.concatenate([q[0], v[0]])
     first, ticks = ticks[0], np.array(ticks[1:])

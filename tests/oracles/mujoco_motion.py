@@ -8,7 +8,9 @@ from scipy.integrate import solve_ivp
 Array = NDArray[np.float64]
 
 
-def motion(model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float = 1e-10) -> Array:
+def motion(
+    model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float = 1e-10, atol: float = 1e-12
+) -> Array:
     """Configurations (n, nq) at times ``t`` (n,) [s] from t[0], of a model that nothing but itself drives."""
     data = mujoco.MjData(model)
     nq = model.nq
@@ -19,7 +21,7 @@ def motion(model: mujoco.MjModel, q0: Array, v0: Array, t: Array, *, rtol: float
         mujoco.mj_forward(model, data)
         return np.concatenate([_qdot(model, data.qpos, data.qvel), data.qacc])
 
-    y = solve_ivp(rate, (t[0], t[-1]), np.concatenate([q0, v0]), "DOP853", t, rtol=rtol, atol=1e-12).y
+    y = solve_ivp(rate, (t[0], t[-1]), np.concatenate([q0, v0]), "DOP853", t, rtol=rtol, atol=atol).y
     q = np.ascontiguousarray(y[:nq].T)
     for row in q:
         mujoco.mj_normalizeQuat(model, row)

@@ -6,14 +6,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-MJCF = Path(__file__).parents[2] / "models" / "mjcf"
-DATA = Path(os.environ.get("PANTOGRAPH_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+ROOT = Path(__file__).resolve().parents[3]
+MJCF = ROOT / "models" / "mjcf"
+DATA = Path(os.environ.get("PANTOGRAPH_DATA", ROOT.parent / "shared" / "data"))
 ROBOTS = {
     "wx250s": "trossen_wx250s/wx250s.xml",
     "dynamixel_2r": "dynamixel_2r/dynamixel_2r.xml",
     "open_manipulator_x": "robotis_open_manipulator_x/open_manipulator_x.xml",
     "humanoid": "humanoid/humanoid.xml",
 }
+FIVE = ("double_pendulum", "ur5", "panda", "quadruped", "humanoid")  # of the measured speeds
+OTHERS = ("wx250s", "dynamixel_2r", "open_manipulator_x", "chain of 40 hinges", "chain of ball joints")
 KINDS = {0: "free", 1: "ball", 2: "slide", 3: "hinge"}
 
 # Kinematics: Universal Robots' "DH parameters for calculations of kinematics and dynamics" (standard DH:
@@ -94,12 +97,20 @@ def chain(n, kind):
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}{'</body>' * n}</worldbody></mujoco>")
 
 
+def names():
+    """All models that the engines must agree on: ours, real robots, chains."""
+    ours = [path.stem for path in sorted(MJCF.glob("*.xml"))]
+    return [*ours, *ROBOTS, "ur5", "panda", "chain of 40 hinges", "chain of ball joints"]
+
+
 def load(name):
     """A model by name; None when its data is not here."""
     if name in ("ur5", "panda"):
         return {"ur5": ur5, "panda": panda}[name]()
     if name.startswith("chain"):
         return chain(40, "hinge") if name == "chain of 40 hinges" else chain(12, "ball")
+    if name == "3 ball joints":
+        return chain(3, "ball")
     path = DATA / "robots" / ROBOTS[name] if name in ROBOTS else MJCF / f"{name}.xml"
     return mujoco.MjModel.from_xml_path(str(path)) if path.exists() else None
 
@@ -147,15 +158,22 @@ def stripped(model):
     )
 
 
-def states(model, count, seed=0):
-    """Random q on the manifold, v, act and u."""
+def states(model, count, seed=0, spread=2.0):
+    """Random q on the manifold, about `spread` [rad, m] from the reference, v, act and u."""
     rng = np.random.default_rng(seed)
     q = np.tile(model.qpos0, (count, 1))
     for row in q:
-        mujoco.mj_integratePos(model, row, 2 * rng.normal(size=model.nv), 1.0)
+        mujoco.mj_integratePos(model, row, spread * rng.normal(size=model.nv), 1.0)
     return (
         q,
         rng.normal(size=(count, model.nv)),
         rng.normal(size=(count, model.na)),
         rng.normal(size=(count, model.nu)),
     )
+
+
+def bent(model):
+    """A start away from the reference: joints by 0.5 to 1.5 rad, base turned as far."""
+    q = model.qpos0.copy()
+    mujoco.mj_integratePos(model, q, np.linspace(0.5, 1.5, model.nv), 1.0)
+    return q

@@ -9,7 +9,7 @@ import numpy as np
 from figures import ENVIRONMENTS, environment, last_line
 
 VENV, DRAKE = ENVIRONMENTS / "pinocchio", ENVIRONMENTS / "drake"
-SOURCE = Path(__file__).parent / "peers" / "pinocchio.cpp"
+SOURCE = Path(__file__).resolve().parents[1] / "peers" / "pinocchio.cpp"
 FLAGS = "-std=c++17 -O3 -march=native -DNDEBUG"
 FLAGS += " -DBOOST_MPL_LIMIT_LIST_SIZE=30 -DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"  # as its CMake files
 
@@ -115,24 +115,33 @@ def _acceleration(model, q, v, a):
     return a
 
 
-def pinocchio(binary, model, q, v, tau):
-    """(ns of a forward dynamics, ns of its derivatives, accelerations at the states)."""
-    rows = joints_of(model)
-    lines = [f"{len(rows)} {len(q)}", " ".join(map(repr, model.opt.gravity.tolist()))]
-    for parent, kind, X, m, c, inertia in rows:
-        numbers = [*X[:3, :3].ravel(), *X[:3, 3], m, *c, *inertia.ravel()]
-        lines.append(f"{parent} {kind} " + " ".join(repr(float(x)) for x in numbers))
-    for state in zip(q, v, tau, strict=True):
-        lines.append(" ".join(repr(float(x)) for part in _vectors(model, *state) for x in part))
-    path = VENV / "model.txt"
-    path.write_text("\n".join(lines))
-    out = subprocess.run([binary, path], capture_output=True, text=True, check=True).stdout.splitlines()
-    aba, derivatives = (float(line.split()[1]) for line in out[:2])
-    a = [
-        _acceleration(model, x, y, np.array(row.split(), float))
-        for x, y, row in zip(q, v, out[2:], strict=True)
-    ]
-    return aba, derivatives, np.array(a)
+class Pinocchio:
+    """Its timing program on a model's states; `binary` is what `program` gave."""
+
+    def __init__(self, binary, model, q, v, tau):
+        self.binary, self.model, self.q, self.v = binary, model, q, v
+        rows = joints_of(model)
+        lines = [f"{len(rows)} {len(q)}", " ".join(map(repr, model.opt.gravity.tolist()))]
+        for parent, kind, X, m, c, inertia in rows:
+            numbers = [*X[:3, :3].ravel(), *X[:3, 3], m, *c, *inertia.ravel()]
+            lines.append(f"{parent} {kind} " + " ".join(repr(float(x)) for x in numbers))
+        for state in zip(q, v, tau, strict=True):
+            lines.append(" ".join(repr(float(x)) for part in _vectors(model, *state) for x in part))
+        self.path = VENV / "model.txt"
+        self.path.write_text("\n".join(lines))
+
+    def _lines(self, *options):
+        command = [self.binary, self.path, *options]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+
+    def seconds(self):
+        """CPU seconds of a forward dynamics and of its derivatives, each a median."""
+        return [float(line.split()[1]) * 1e-9 for line in self._lines("time")]
+
+    def accelerations(self):
+        """Of all states, in MuJoCo's frames."""
+        rows = zip(self.q, self.v, self._lines("accelerations"), strict=True)
+        return np.array([_acceleration(self.model, x, y, np.array(row.split(), float)) for x, y, row in rows])
 
 
 def drake_python():
@@ -169,31 +178,38 @@ def _words(numbers):
     return " ".join(repr(float(x)) for x in numbers)
 
 
-def drake(python, model, q, v, tau):
-    """(ns of a forward dynamics, ns of the calls taken off, accelerations); a sentence when it is refused.
+class Drake:
+    """Its forward dynamics on a model's states, by the Python that `drake_python` gave.
 
     Drake's free joints: quaternion before position, turning before moving, both in the world.
     """
-    free = np.flatnonzero(model.jnt_type == 0)
-    turns = {j: [_turn(x[k + 3 : k + 7]) for x in q] for j in free for k in [model.jnt_qposadr[j]]}
-    q, v, tau = q.copy(), v.copy(), tau.copy()
-    for j in free:
-        at, dof = model.jnt_qposadr[j], model.jnt_dofadr[j]
-        q[:, at : at + 7] = np.roll(q[:, at : at + 7], 4, axis=1)
-        for x in (v, tau):
-            turned = np.einsum("nij,nj->ni", turns[j], x[:, dof + 3 : dof + 6])
-            x[:, dof : dof + 6] = np.hstack([turned, x[:, dof : dof + 3]])
-    path, given, result = (DRAKE / name for name in ("model.xml", "states.npz", "result.npz"))
-    path.write_text(_mjcf(model))
-    np.savez(given, q=q, v=v, tau=tau)
-    command = [python, SOURCE.parent / "drake_aba.py", path, given, result]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        return f"absent: {last_line(done.stderr)}"
-    got = np.load(result)
-    a = got["a"].copy()
-    for j in free:
-        dof = model.jnt_dofadr[j]
-        turned = np.einsum("nji,nj->ni", turns[j], a[:, dof : dof + 3])
-        a[:, dof : dof + 6] = np.hstack([a[:, dof + 3 : dof + 6], turned])
-    return float(got["ns"]), float(got["call_ns"]), a
+
+    def __init__(self, python, model, q, v, tau):
+        self.model, self.free = model, np.flatnonzero(model.jnt_type == 0)
+        self.turns = {
+            j: [_turn(x[k + 3 : k + 7]) for x in q] for j in self.free for k in [model.jnt_qposadr[j]]
+        }
+        q, v, tau = q.copy(), v.copy(), tau.copy()
+        for j in self.free:
+            at, dof = model.jnt_qposadr[j], model.jnt_dofadr[j]
+            q[:, at : at + 7] = np.roll(q[:, at : at + 7], 4, axis=1)
+            for x in (v, tau):
+                turned = np.einsum("nij,nj->ni", self.turns[j], x[:, dof + 3 : dof + 6])
+                x[:, dof : dof + 6] = np.hstack([turned, x[:, dof : dof + 3]])
+        path, given, self.result = (DRAKE / name for name in ("model.xml", "states.npz", "result.npz"))
+        path.write_text(_mjcf(model))
+        np.savez(given, q=q, v=v, tau=tau)
+        self.command = [python, SOURCE.parent / "drake_aba.py", path, given, self.result]
+
+    def run(self):
+        """CPU seconds of a forward dynamics and of the calls taken off, and accelerations; or why not."""
+        done = subprocess.run(self.command, capture_output=True, text=True)
+        if done.returncode:
+            return f"absent: {last_line(done.stderr)}"
+        got = np.load(self.result)
+        a = got["a"].copy()
+        for j in self.free:
+            dof = self.model.jnt_dofadr[j]
+            turned = np.einsum("nji,nj->ni", self.turns[j], a[:, dof : dof + 3])
+            a[:, dof : dof + 6] = np.hstack([a[:, dof + 3 : dof + 6], turned])
+        return float(got["seconds"]), float(got["call_seconds"]), a
