@@ -16,7 +16,7 @@ from .chain import chain
 from .diagnose import captured_warnings
 from .errors import ModelError, ModelWarning, PantographError, unknown
 from .library import data_robots, find, load_model, load_spec, names
-from .naming import Kind, joint_names, lookup, name_of, names_of
+from .naming import Kind, dof_names, joint_names, lookup, name_of, names_of
 
 __all__ = [
     "Kind",
@@ -26,6 +26,7 @@ __all__ = [
     "captured_warnings",
     "chain",
     "data_robots",
+    "dof_names",
     "find",
     "joint_names",
     "load_model",

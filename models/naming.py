@@ -50,6 +50,19 @@ def joint_names(model: mujoco.MjModel) -> tuple[str, ...]:
     return names_of(model, "joint")
 
 
+def dof_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of all degrees of freedom (nv,): their joint's, with a letter where it has several."""
+    letters = {
+        int(mujoco.mjtJoint.mjJNT_FREE): (".x", ".y", ".z", ".rx", ".ry", ".rz"),
+        int(mujoco.mjtJoint.mjJNT_BALL): (".rx", ".ry", ".rz"),
+    }
+    return tuple(
+        name + letter
+        for joint, name in enumerate(joint_names(model))
+        for letter in letters.get(int(model.jnt_type[joint]), ("",))
+    )
+
+
 def lookup(model: mujoco.MjModel, kind: Kind, name: str) -> int:
     """Index of a named part; understands the display names that `name_of` gives to unnamed parts.
 

@@ -336,7 +336,7 @@ def test_a_scene_says_machine_and_contacts(tmp_path):
     assert (tmp_path / "sway.gif").exists()
     assert np.abs(load(tmp_path / "sway.fit.npz").v[:, 0]).max() <= 1.4 * (1 + 1e-3)
     done = run.invoke(app, [str(scene), "--out", str(tmp_path), "--how", "check", "--velocity", "2"])
-    assert re.search(r"shoulder +velocity +1\.125 +2 +56\.2%", done.output)
+    assert re.search(r"shoulder +velocity +1\.125 +2 +56\.[23]%", done.output)
     scene.write_text(scene.read_text() + '[[fit.phases]]\nsites = ["tipp"]\nstart = 0\nstop = 0.2\n')
     with pytest.raises(PantographError, match="no site 'tipp'"):
         run.invoke(app, [str(scene)], catch_exceptions=False)

@@ -237,9 +237,13 @@ def test_check_says_where_and_by_how_much():
         (line(3.5), {"velocity": 1.0}, "no timing helps: shoulder: 0.4 rad or m beyond"),
         (arm_clip(0, kind="step"), {"velocity": 1.0}, "the path jumps at"),
         (line(1.0), {"velocity": {"sholder": 1.0}}, "did you mean 'shoulder'"),
-        (line(1.0), {"velocity": -1.0}, "must be a number >= 0"),
-        (line(1.0), {"velocity": 0.0}, "must be positive"),
-        (line(1.0), {"driven": np.array([True, False])}, "needs a drive at every"),
+        (line(1.0), {"velocity": -1.0}, "velocity must be a positive number, got -1.0"),
+        (line(1.0), {"velocity": 0.0}, "velocity must be a positive number, got 0.0"),
+        (
+            line(1.0),
+            {"driven": np.array([True, False])},
+            "needs a drive at every joint of what moves, and nothing drives .elbow.",
+        ),
     ],
 )
 def test_what_cannot_be_helped_is_said(clip, limits, words):

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip, Motion
-from .check import MISSING, forces, shares
+from ...sim.clip import Clip
+from .check import MISSING, follow, forces, shares
 from .contact import Phase, places
 from .machine import Machine
 
@@ -35,9 +35,8 @@ def examine(
     in between.
     """
     pieces, part = len(t) - 1, np.linspace(0.0, 1.0, _FINER + 1)
-    fine = t[:-1, None] + np.diff(t)[:, None] * part
-    fine[:, -1] = t[1:]
-    motion = _both_sides(clip, fine)
+    trace = follow(clip, t, _FINER)
+    motion = trace.motion
     need = forces(motion, machine)
     largest = max(float(np.abs(need).max()), 1e-12)
     share, stray = np.zeros(pieces), 0.0
@@ -49,18 +48,9 @@ def examine(
         stray = _strays(p.reshape(pieces, len(part), -1), t, sites, phases)
         share = _slips(pushed, t, sites, phases, machine)
     missing = np.abs(need[:, ~machine.driven]).max(axis=1, initial=0.0) / largest
-    for used in (
-        row.share for row in shares(fine.ravel(), motion, machine, need=need) if row.kind != MISSING
-    ):
+    for used in (row.share for row in shares(trace, machine, need=need) if row.kind != MISSING):
         share = np.maximum(share, used.reshape(pieces, -1).max(axis=1))
     return Finding(share, missing.reshape(pieces, -1).max(axis=1), stray)
-
-
-def _both_sides(clip: Clip, fine: Array) -> Motion:
-    """Rows of motion at times (pieces, points), the last of each piece from the left."""
-    right, left = clip.evaluate(fine[:, :-1]), clip.evaluate(fine[:, -1:], left=True)
-    joined = (np.concatenate([a, b], axis=1) for a, b in zip(right, left, strict=True))
-    return Motion(*(x.reshape(-1, x.shape[-1]) for x in joined))
 
 
 def _strays(p: Array, t: Array, sites: Sequence[str], phases: Sequence[Phase]) -> float:

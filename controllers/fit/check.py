@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import name_of
-from ...sim.clip import Clip, Motion
-from ...sim.kinds import BALL, FREE
+from ...models import dof_names
+from ...sim.clip import Clip, FreeTrack, Motion, Track
+from ...sim.curves import Curve
 from .contact import Phase, missing
 from .machine import Machine
 
@@ -77,43 +76,102 @@ class Report:
         return self.worst <= 1.0 + 1e-6
 
 
+class Trace(NamedTuple):
+    """Rows of motion along pieces of a clip, the last of each from the left: t (n,) [s], q, v, a, and
+    ``jerk`` (n, nv), infinite where accelerations jump."""
+
+    t: Array
+    motion: Motion
+    jerk: Array
+
+
 def check(clip: Clip, machine: Machine, *, phases: Sequence[Phase] = (), points: int = 2000) -> Report:
-    """Compare a clip with a machine at ``points`` times and on both sides of every break.
+    """Compare a clip with a machine at ``points`` times and more, and on both sides of every break.
 
     Freedoms with keys but without a drive need forces that nothing gives, unless the contacts of ``phases``
     do: what is missing is a violation as well.
     """
-    t, motion = samples(clip, points)
-    need = forces(motion, machine)
-    need, _ = missing(machine.model, phases, t, motion.q, need, np.flatnonzero(~machine.driven & clip.dofs))
-    return _report(t, shares(t, motion, machine, keyed=clip.dofs, need=need))
+    part = 5
+    grid = np.linspace(clip.start, clip.end, max(points // part, 1) + 1)
+    nodes = np.union1d(grid, knots(clip))
+    nodes = nodes[np.append(True, np.diff(nodes) > 1e-12 * max(1.0, abs(nodes[-1])))]
+    trace = follow(clip, nodes if len(nodes) > 1 else np.repeat(nodes, 2), part)
+    need = forces(trace.motion, machine)
+    loose = np.flatnonzero(~machine.driven & clip.dofs)
+    need, _ = missing(machine.model, phases, trace.t, trace.motion.q, need, loose)
+    return report(trace, machine, keyed=clip.dofs, need=need)
 
 
-def samples(clip: Clip, points: int) -> tuple[Array, Motion]:
-    """Times over the whole clip, breaks twice, and the motion there: from the left, then from the right."""
-    grid = np.linspace(clip.start, clip.end, points)
-    breaks = np.concatenate([clip.breaks_between(clip.start, clip.end), [clip.end]])
-    right, left = clip.evaluate(np.union1d(grid, breaks[:-1])), clip.evaluate(breaks, left=True)
-    t = np.concatenate([breaks, np.union1d(grid, breaks[:-1])])
-    order = np.argsort(t, kind="stable")
-    return t[order], Motion(*(np.concatenate([a, b])[order] for a, b in zip(left, right, strict=True)))
+def follow(clip: Clip, nodes: Array, parts: int = 10) -> Trace:
+    """Motion at ``parts`` + 1 points on each piece between times ``nodes`` (n + 1,) of a clip.
 
-
-def check_motion(
-    t: Array, motion: Motion, machine: Machine, *, keyed: NDArray[np.bool_] | None = None
-) -> Report:
-    """Compare rows of motion at ascending times t (n,) [s] with a machine; jerk by differences of rows.
-
-    Only positions of the freedoms ``keyed`` (nv,), and forces missing there, are judged (default: all).
+    Knots of the clip are to be among the nodes: jerk follows from accelerations at four points of a piece
+    each, which is exact where these are cubics.
     """
-    return _report(t, shares(t, motion, machine, keyed=keyed))
+    part = np.linspace(0.0, 1.0, parts + 1)
+    h = np.diff(nodes)
+    fine = nodes[:-1, None] + h[:, None] * part
+    fine[:, -1] = nodes[1:]
+    right, left = clip.evaluate(fine[:, :-1]), clip.evaluate(fine[:, -1:], left=True)
+    q, v, a = (np.concatenate(pair, axis=1) for pair in zip(right, left, strict=True))
+    jerk = np.einsum("ij,pjd->pid", _slopes(parts), a) / np.maximum(h, 1e-300)[:, None, None]
+    real = 1e-9 * (1.0 + np.abs(a).max(initial=0.0))
+    jumps = np.abs(a[1:, 0] - a[:-1, -1]) > real
+    # only a break is one: elsewhere it is the rounding of short pieces
+    jumps &= np.isin(nodes[1:-1], nodes[1:-1][_near(nodes[1:-1], clip.breaks_between(clip.start, clip.end))])[
+        :, None
+    ]
+    jerk[1:, 0][jumps] = jerk[:-1, -1][jumps] = np.inf
+    still = 1e-9 * (1.0 + np.abs(v).max(initial=0.0))
+    for at in ((0, 0), (-1, -1)):  # out of rest, and into it
+        jerk[at][(np.abs(v[at]) <= still) & (np.abs(a[at]) > real)] = np.inf
+    rows = Motion(*(x.reshape(-1, x.shape[-1]) for x in (q, v, a)))
+    return Trace(fine.ravel(), rows, np.abs(jerk).reshape(rows.a.shape))
 
 
-def _report(t: Array, uses: Sequence[Use]) -> Report:
-    every = [_worst(t, use) for use in uses]
+def _near(t: Array, breaks: Array) -> NDArray[np.bool_]:
+    """Which of ascending times t (n,) are breaks, up to rounding."""
+    if not len(breaks):
+        return np.zeros(len(t), dtype=bool)
+    k = np.clip(np.searchsorted(breaks, t), 1, len(breaks) - 1) if len(breaks) > 1 else np.zeros(len(t), int)
+    gap = np.minimum(np.abs(t - breaks[k]), np.abs(t - breaks[np.maximum(k - 1, 0)]))
+    return np.asarray(gap <= 1e-12 * max(1.0, float(np.abs(breaks).max())))
+
+
+def _slopes(parts: int) -> Array:
+    """Weights (parts + 1, parts + 1) of values at even points of [0, 1] in the slopes there of the cubics
+    through the nearest four (all, where there are fewer)."""
+    x, out = np.linspace(0.0, 1.0, parts + 1), np.zeros((parts + 1, parts + 1))
+    many = min(4, parts + 1)
+    for i in range(parts + 1):
+        k = min(max(i - 1, 0), parts + 1 - many)
+        powers = np.vander(x[k : k + many] - x[i], increasing=True)
+        out[i, k : k + many] = np.linalg.inv(powers)[1]
+    return out
+
+
+def knots(clip: Clip) -> Array:
+    """Times of a clip where any derivative may jump, those of the first turn of loops."""
+    inner = [curve.knots for track in clip.tracks.values() for curve in curves_of(track)]
+    every = np.concatenate([*inner, clip.breaks_between(clip.start, clip.end), [clip.start, clip.end]])
+    return np.unique(every[(every >= clip.start) & (every <= clip.end)])
+
+
+def curves_of(track: Track) -> tuple[Curve, ...]:
+    """The curves of a track: two where a free joint has both keyed."""
+    if isinstance(track, FreeTrack):
+        return tuple(c for c in (track.position, track.rotation) if c is not None)
+    return (track,)
+
+
+def report(
+    trace: Trace, machine: Machine, *, keyed: NDArray[np.bool_] | None = None, need: Array | None = None
+) -> Report:
+    """Compare rows of motion with a machine; see :func:`shares`."""
+    every = [_worst(trace.t, use) for use in shares(trace, machine, keyed=keyed, need=need)]
     every.sort(key=lambda v: -v.share)
     found = tuple(v for v in every if v.share > 1.0 + 1e-9)
-    return Report(found, every[0].share if every else 0.0, t, tuple(every))
+    return Report(found, every[0].share if every else 0.0, trace.t, tuple(every))
 
 
 def _worst(t: Array, use: Use) -> Violation:
@@ -125,64 +183,62 @@ def _worst(t: Array, use: Use) -> Violation:
 
 
 def shares(
-    t: Array,
-    motion: Motion,
+    trace: Trace,
     machine: Machine,
     *,
     keyed: NDArray[np.bool_] | None = None,
     need: Array | None = None,
 ) -> list[Use]:
-    """Every limit of a machine along rows of motion; ``need`` (n, nv) are the joint forces, less contacts."""
+    """Every limit of a machine along rows of motion; ``need`` (n, nv) are the joint forces, less contacts.
+
+    Only positions of the freedoms ``keyed`` (nv,), and forces missing there, are judged (default: all).
+    """
     out: list[Use] = []
-    m = machine.model
-    tau = forces(motion, machine) if need is None else need
+    m, motion = machine.model, trace.motion
+    if need is None and machine.asks_forces:
+        need = forces(motion, machine)
     keyed = np.ones(m.nv, dtype=bool) if keyed is None else keyed
-    most = max(float(np.abs(tau).max(initial=0.0)), 1e-12)
-    for dof, who in enumerate(freedoms(m)):
+    for dof, who in enumerate(dof_names(m)):
         low, high = machine.low[dof], machine.high[dof]
         if np.isfinite(high - low) and keyed[dof]:
             q = motion.q[:, m.jnt_qposadr[m.dof_jntid[dof]]]
             beyond = np.maximum(low - q, q - high)
             out.append(Use("position", who, beyond, 0.0, 1.0 + beyond / max(high - low, 1e-12)))
-        plain = (("velocity", motion.v, machine.velocity), ("acceleration", motion.a, machine.acceleration))
-        for kind, values, limits in plain:
+        rates = (
+            ("velocity", motion.v, machine.velocity),
+            ("acceleration", motion.a, machine.acceleration),
+            ("jerk", trace.jerk, machine.jerk),
+        )
+        for kind, values, limits in rates:
             if np.isfinite(limits[dof]):
                 size = np.abs(values[:, dof])
                 out.append(Use(kind, who, size, float(limits[dof]), size / limits[dof]))
-        if np.isfinite(machine.jerk[dof]):
-            jerk = _jerk(t, motion.v[:, dof], motion.a[:, dof])
-            out.append(Use("jerk", who, jerk, float(machine.jerk[dof]), jerk / machine.jerk[dof]))
-        if machine.driven[dof]:
-            out += _force(who, dof, tau[:, dof], motion.v[:, dof], machine)
-        elif keyed[dof]:
-            size = np.abs(tau[:, dof])
-            over = np.where(size > 1e-9 * most, size / most, 0.0)
-            out.append(Use(MISSING, who, size, 0.0, np.where(over > 0, 1.0 + over, 0.0)))
-    if np.isfinite(machine.current):
-        draw = np.abs(np.where(machine.driven, tau, 0.0)) @ machine.ampere
+        if need is not None:
+            out += _pushes(who, dof, need, motion.v[:, dof], machine, keyed[dof])
+    if need is not None and np.isfinite(machine.current):
+        draw = np.abs(np.where(machine.driven, need, 0.0)) @ machine.ampere
         out.append(Use("current", "battery", draw, machine.current, draw / machine.current))
     return out
 
 
-def _jerk(t: Array, v: Array, a: Array) -> Array:
-    """Size (n,) of differences of accelerations; infinite where they jump, out of and into rest included."""
-    gap, change, out = np.diff(t), np.abs(np.diff(a)), np.zeros(len(t))
-    moves, real = gap > 1e-9, 1e-9 * (1.0 + np.abs(a).max())
-    out[1:][moves] = change[moves] / gap[moves]
-    out[1:][~moves & (change > real)] = np.inf
-    for end in (0, -1):
-        if abs(v[end]) <= 1e-9 * (1.0 + np.abs(v).max()) and abs(a[end]) > real:
-            out[end] = np.inf
-    return out
+def _pushes(who: str, dof: int, need: Array, v: Array, machine: Machine, keyed: bool) -> list[Use]:
+    """What a freedom's force asks of its drive, or of nothing."""
+    if machine.driven[dof]:
+        return _force(who, dof, need[:, dof], v, machine)
+    if not keyed:
+        return []
+    most = max(float(np.abs(need).max(initial=0.0)), 1e-12)
+    size = np.abs(need[:, dof])
+    over = np.where(size > 1e-9 * most, size / most, 0.0)
+    return [Use(MISSING, who, size, 0.0, np.where(over > 0, 1.0 + over, 0.0))]
 
 
-def freedoms(model: mujoco.MjModel) -> list[str]:
-    """Names of all freedoms (nv,): their joint's, with a letter where it has several."""
-    letters = {FREE: ("x", "y", "z", "rx", "ry", "rz"), BALL: ("rx", "ry", "rz")}
-    out = []
-    for joint in range(model.njnt):
-        name, kind = name_of(model, "joint", joint), int(model.jnt_type[joint])
-        out += [f"{name}.{x}" for x in letters[kind]] if kind in letters else [name]
+def by_piece(machine: Machine, t: Array, clip: Clip) -> Array:
+    """Largest share (n,) of a limit in use on each piece between times t (n + 1,)."""
+    out = np.zeros(len(t) - 1)
+    for use in shares(follow(clip, t), machine, keyed=clip.dofs):
+        if use.kind != "position":
+            out = np.maximum(out, use.share.reshape(len(out), -1).max(axis=1))
     return out
 
 

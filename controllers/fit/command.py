@@ -63,8 +63,8 @@ def fit(
     if how not in WAYS:
         raise PantographError(f"no way {how!r} to fit; there is: {', '.join(WAYS)}")
     texts = dict(zip(LIMITS, (velocity, acceleration, jerk, force, top_speed, ampere), strict=True))
-    limits = {word: _limit(text) for word, text in texts.items() if text}
-    task = task_of(loaded, **limits, current=current, passive=passive, hard=hard)
+    limits = {word: _limit(word, text) for word, text in texts.items() if text}
+    task = task_of(loaded, **limits, current=current, passive=passive or None, hard=hard or None)
     clip, able, phases = task.clip, task.machine, task.phases
     if not clip.end > clip.start:
         raise PantographError(f"{scene} keys no motion: no joint has two keys")
@@ -116,7 +116,28 @@ def _retime(clip: Any, able: Any, keep: bool) -> tuple[Any, bool]:
     was = clip.end - clip.start
     console.print(_table(found.report, "retimed"))
     console.print(f"retimed: {found.duration:.4f} s, was {was:.4f} s")
+    _tell_stops(found)
     return found.clip, found.report.possible
+
+
+def _tell_stops(found: Any) -> None:
+    """Where the path makes the machine stop, and what would not."""
+    for stop in found.stops[:8]:
+        console.print(f"stops at {stop.t:.3f} s (keys: {stop.s:.3f} s): {escape(stop.why)}", soft_wrap=True)
+    if len(found.stops) > 8:
+        console.print(f"and at {len(found.stops) - 8} more")
+    if found.stops:
+        console.print(
+            '[yellow]note:[/] no motion passes there without a stop: smoother keys (curve = "natural" or '
+            '"clamped") or --how fit, which may leave the path, need none',
+            soft_wrap=True,
+        )
+    if found.slowed > 1.05:
+        console.print(
+            f"[yellow]note:[/] slowed by {found.slowed - 1.0:.0%} as a whole for limits between points of "
+            "the path, where it turns sharply: a faster timing exists",
+            soft_wrap=True,
+        )
 
 
 def _table(report: Any, title: str) -> Table:
@@ -180,16 +201,19 @@ def _recording(plan: Any, clip: Any) -> Any:
     return run(replace(plan, setup=setup, problem=problem, engine=kinematic, period=None))
 
 
-def _limit(texts: list[str]) -> float | dict[str, float]:
-    """One number for all joints, or one a joint from texts such as elbow=2."""
-    named = {}
+def _limit(what: str, texts: list[str]) -> dict[str, float]:
+    """Limits by joint from texts such as elbow=2; one without a name stands for all others, as ""."""
+    named: dict[str, float] = {}
     for text in texts:
-        name, sign, value = text.rpartition("=")
+        name, _, value = text.rpartition("=")
+        option = f"--{what.replace('_', '-')}"
         try:
             number = float(value)
         except ValueError:
-            raise PantographError(f"a limit is a number, or JOINT=number, not {text!r}") from None
-        if not sign:
-            return number
+            raise PantographError(f"{option} is a number, or JOINT=number, not {text!r}") from None
+        if name in named:
+            raise PantographError(
+                f"{option} is given twice for {f'joint {name!r}' if name else 'all joints'}"
+            )
         named[name] = number
     return named

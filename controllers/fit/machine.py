@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...sim.errors import PantographError
 from ...sim.kinds import SCALAR
-from ..gains import force_limits, per_joint
+from ..gains import force_limits, limit_per_joint, per_joint
 from ..nominal import Nominal
 
 Array = NDArray[np.float64]
@@ -42,6 +42,12 @@ class Machine:
     driven: NDArray[np.bool_]
 
     @property
+    def asks_forces(self) -> bool:
+        """Whether any limit is one of forces."""
+        limited = np.isfinite(self.force_high - self.force_low) & self.driven
+        return bool(limited.any() or not self.driven.all() or np.isfinite(self.current))
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The machine's model, without its actuators."""
         return self.nominal.model
@@ -62,7 +68,8 @@ def machine(
     """The machine of a model: ranges and forces as its file says, the rest as given (None: no limit).
 
     A limit is one number for all that is ``driven``, or one a joint by name (other joints have none);
-    ``force`` replaces the file's. Raises PantographError for negative limits and names of no joint.
+    ``force`` replaces the file's. Raises PantographError for limits that are not positive, for names of no
+    joint, and for a battery that feeds nothing.
     """
     low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in np.flatnonzero(model.jnt_limited):
@@ -74,7 +81,15 @@ def machine(
         force_low = -force_high
     driven = np.ones(model.nv, dtype=bool) if driven is None else np.asarray(driven, dtype=bool)
     if not current > 0:
-        raise PantographError(f"the battery's current must be positive, got {current!r}")
+        raise PantographError(
+            f"current of the battery must be a positive number, got {current!r}: leave it out for no limit"
+        )
+    if np.isfinite(current) and ampere is None:
+        raise PantographError(
+            "current of the battery limits nothing without what it feeds: give 'ampere', the current that "
+            "a joint's drive draws for each N m or N, too"
+        )
+
     return Machine(
         Nominal(model),
         low,
@@ -91,18 +106,11 @@ def machine(
     )
 
 
-def _moving(model: mujoco.MjModel, what: str, value: Limit, driven: NDArray[np.bool_]) -> Array:
-    limit = _limit(model, what, value)
-    return limit if isinstance(value, Mapping) else np.where(driven, limit, np.inf)
+def _moving(model: mujoco.MjModel, what: str, limit: Limit, driven: NDArray[np.bool_]) -> Array:
+    """One number for all is no limit of what nothing drives."""
+    out = _limit(model, what, limit)
+    return out if isinstance(limit, Mapping) else np.where(driven, out, np.inf)
 
 
-def _limit(model: mujoco.MjModel, what: str, value: Limit) -> Array:
-    if value is None:
-        return np.full(model.nv, np.inf)
-    if isinstance(value, int | float) and value == np.inf:
-        return np.full(model.nv, np.inf)
-    given = per_joint(model, what, value)
-    named = per_joint(model, what, dict.fromkeys(value, 1.0) if isinstance(value, Mapping) else 1.0) > 0
-    if (given[named] <= 0).any():
-        raise PantographError(f"a limit of {what} must be positive")
-    return np.where(named, given, np.inf)
+def _limit(model: mujoco.MjModel, what: str, limit: Limit) -> Array:
+    return limit_per_joint(model, what, None if limit == np.inf else limit)

@@ -1,30 +1,27 @@
-"""The fastest, or the nearest, timing of a path that a machine can follow: time-optimal parameterisation.
-
-Along a path q(s) with x = (ds/dt)^2 and u = d2s/dt2 constant on each piece of a grid, limits are linear in
-(u, x): backwards over the grid goes the largest x from which the rest can still be done, forwards the largest
-acceleration that stays below it (H. Pham, Q.-C. Pham, A new approach to time-optimal path parameterization,
-IEEE Trans. Robotics 34, 2018). Limits hold at both ends of each piece; friction and the falling force of
-motors, which go with sqrt(x), are bounded from above by their tangent at the last solution, so that each
-round is feasible and faster than the one before.
-"""
+"""The fastest, or the nearest, timing of a path that a machine can follow."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip, FreeTrack, Motion, Track
+from ...models import dof_names
+from ...sim.clip import Clip, FreeTrack, Track
 from ...sim.curves import Curve
 from ...sim.errors import PantographError
-from .check import Report, check_motion, forces
+from .check import Report, Violation, by_piece, follow, report
+from .grid import Grid, even
 from .machine import Machine
+from .path import Corner
 from .smooth import smooth
 
 Array = NDArray[np.float64]
-_FLOOR = 1e-9  # x below this part of its bound counts as standing still when sqrt(x) is bounded
+_ROUNDS, _NEAR = 5, 1.003  # of cutting pieces, until limits hold to this between points
+_TIGHT = 5e-7  # part of a limit that may be exceeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +49,28 @@ class RetimedCurve(Curve):
         return q, v * rate[:, None], v * bend[:, None] + a * (rate**2)[:, None]
 
 
+class Stop(NamedTuple):
+    """Where the machine has to stop on its way: time of the keys ``s`` [s], new time ``t``, and why."""
+
+    s: float
+    t: float
+    why: str
+
+
 @dataclass(frozen=True, eq=False)
 class Retimed:
     """A clip with a possible timing, its ``duration`` [s], and the report on a grid ten times finer than the
-    one it was computed on. ``t`` (n,) are the new times of the old times ``s`` (n,)."""
+    one it was computed on. ``t`` (n,) are the new times of the old times ``s`` (n,). ``stops``: where the
+    path makes the machine stop, though the keys do not. ``slowed``: by how much the whole was slowed for what
+    lies between the points of the grid."""
 
     clip: Clip
     duration: float
     report: Report
     s: Array
     t: Array
+    stops: tuple[Stop, ...]
+    slowed: float
 
 
 def retime(
@@ -71,259 +80,89 @@ def retime(
 
     Limits of velocity, acceleration, force (with the motor's top speed) and current hold; the path does not
     change, and stretches where nothing moves keep their length. It starts and ends ``at_rest``, or at the
-    keyed speed. With a limit on jerk it stops where the path's curvature jumps, as it does at the keys of
-    curves that are not natural or clamped, and the motion is quintics through points of the path. Raises
-    PantographError where the path itself is impossible (positions out of range, a pose that the drives cannot
-    hold), and for freedoms without a drive.
+    keyed speed. It stops where the path has a corner, as linear keys have, and with a limit on jerk where its
+    curvature jumps, as it does at the keys of curves that are not natural or clamped; the motion is then
+    quintics through points of the path. Raises PantographError where the path itself is impossible (positions
+    out of range, a pose that the drives cannot hold), for freedoms without a drive, and where no timing is
+    found.
     """
-    if not machine.driven.all():
-        raise PantographError("retiming needs a drive at every moving joint: fit the motion instead")
-    grid = _Grid(clip, machine, points)
-    x = grid.solve(keep, at_rest)
-    for _ in range(6 if grid.curved else 0):
-        better = grid.solve(keep, at_rest, about=x)
-        done = np.abs(better - x).max() <= 1e-4 * x.max()
-        x = better
-        if done:
+    tree = machine.model.dof_treeid
+    loose = np.flatnonzero(~machine.driven & np.isin(tree, tree[clip.dofs]))
+    if len(loose):
+        names = dof_names(machine.model)
+        raise PantographError(
+            f"retiming needs a drive at every joint of what moves, and nothing drives {names[loose[0]]!r}: "
+            "fit the motion instead (--how fit)"
+        )
+    if not clip.end > clip.start:
+        raise PantographError("there is nothing to retime: no joint has two keys")
+    for name, track in clip.tracks.items():
+        if isinstance(track, FreeTrack):
+            raise PantographError(f"joint {name!r} is free: no machine moves it along keys; fit the motion")
+    grid = Grid(clip, machine, even(clip, points))
+    x = grid.fastest(keep, at_rest)
+    if np.isfinite(machine.jerk[clip.dofs]).any():
+        at, s, corners = smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points)
+        return _slowed(at, s, corners, machine)
+    for _ in range(_ROUNDS):
+        at = _parabolas(grid, x)
+        coarse = by_piece(machine, *at(1.0)) > _NEAR
+        if not coarse.any() or len(grid.s) > 8 * points:
             break
-    if np.isfinite(machine.jerk).any():
-        return grid.slowed(*smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points))
-    return grid.result(x)
+        grid = Grid(clip, machine, np.union1d(grid.s, 0.5 * (grid.s[1:] + grid.s[:-1])[coarse]))
+        x = grid.fastest(keep, at_rest)
+    return _slowed(_parabolas(grid, x), grid.s, grid.corners(), machine)
 
 
-class _Grid:
-    """The path on a grid, with rows a u + b x + e sqrt(x) <= c of the limits at both ends of each piece."""
+def _parabolas(grid: Grid, x: Array) -> Callable[[float], tuple[Array, Clip]]:
+    """Times and the clip of squared rates x (n + 1,), by how much it is slowed."""
+    rate = np.sqrt(x)
+    steps = 2.0 * grid.h / np.maximum(rate[:-1] + rate[1:], 1e-300)
+    bend = 0.5 * np.diff(x) / grid.h
 
-    def __init__(self, clip: Clip, machine: Machine, points: int) -> None:
-        self.clip, self.machine = clip, machine
-        breaks = clip.breaks_between(clip.start, clip.end)
-        self.s = np.union1d(np.linspace(clip.start, clip.end, points + 1), breaks)
-        keep = np.concatenate([[True], np.diff(self.s) > 1e-9 * (clip.end - clip.start)])
-        self.s = self.s[keep]
-        self.h = np.diff(self.s)
-        begin, end = clip.evaluate(self.s[:-1]), clip.evaluate(self.s[1:], left=True)
-        gap = np.abs(begin.q[1:] - end.q[:-1]).max(axis=1, initial=0.0) > 1e-9
-        if gap.any():
-            raise PantographError(f"no timing helps: the path jumps at {self.s[1:-1][gap][0]:.4g} s")
-        rows0, rows1 = self.rows(begin), self.rows(end)
-        # at the end of a piece x has become x + 2 h u
-        a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
-        self.a, self.b, self.c, self.e = (
-            np.concatenate(pair, axis=1)
-            for pair in ((rows0[0], a1), (rows0[1], rows1[1]), (rows0[2], rows1[2]), (rows0[3], rows1[3]))
-        )
-        self.half = rows0[0].shape[1]
-        self.curved = bool(np.any(self.e > 0))
-        speed = np.maximum(np.abs(begin.v), 1e-150)
-        cap0 = np.min((machine.velocity / speed) ** 2, axis=1)
-        cap1 = np.min((machine.velocity / np.maximum(np.abs(end.v), 1e-150)) ** 2, axis=1)
-        self.cap = np.minimum(np.append(cap0, np.inf), np.append(np.inf, cap1))
-        top = np.max(np.abs(np.vstack([begin.v, end.v])), initial=0.0)
-        still = np.abs(begin.v).max(axis=1) + np.abs(end.v).max(axis=1) <= 1e-9 * top
-        self.still = still
-        resting = np.append(still, False) | np.append(False, still)
-        self.cap = np.where(resting, np.minimum(self.cap, 1.0), np.minimum(self.cap, 1e8))
-        # where the path has a corner, nothing but a stop goes round it
-        corner = np.abs(begin.v[1:] - end.v[:-1]).max(axis=1, initial=0.0) > 1e-6 * top
-        self.cap[1:-1][corner] = 0.0
-        self.moving = (
-            bool(np.any(np.abs(begin.v[0]) > 1e-9 * top)),
-            bool(np.any(np.abs(end.v[-1]) > 1e-9 * top)),
-        )
-
-    def rows(self, at: Motion) -> tuple[Array, Array, Array, Array]:
-        """a, b, c, e (n, rows) of the limits at states of the path."""
-        m = self.machine
-        a: list[Array] = []
-        b: list[Array] = []
-        c: list[Array] = []
-        e: list[Array] = []
-
-        def add(ai: Array, bi: Array, ci: Array | float, ei: Array | float = 0.0) -> None:
-            for into, value in ((a, ai), (b, bi), (c, ci), (e, ei)):
-                into.append(np.broadcast_to(value, ai.shape))
-
-        for dof in np.flatnonzero(np.isfinite(m.acceleration)):
-            for sign in (1.0, -1.0):
-                add(sign * at.v[:, dof], sign * at.a[:, dof], m.acceleration[dof])
-        limited = np.isfinite(m.force_high - m.force_low)
-        if limited.any() or np.isfinite(m.current):
-            self._force_rows(at, limited, add)
-        if not a:
-            zero = np.zeros(len(at.v))
-            add(zero, zero, 1.0)
-        return tuple(np.stack(x, axis=1) for x in (a, b, c, e))  # type: ignore[return-value]
-
-    def _force_rows(self, at: Motion, limited: NDArray[np.bool_], add) -> None:  # type: ignore[no-untyped-def]
-        """tau = m u + k x + d sqrt(x) + g, from four inverse dynamics."""
-        machine, zero = self.machine, np.zeros_like(at.v)
-        weight = forces(Motion(at.q, zero, zero), machine)
-        push = forces(Motion(at.q, zero, at.v), machine) - weight
-        forth = forces(Motion(at.q, at.v, at.a), machine)
-        back = forces(Motion(at.q, -at.v, at.a), machine)
-        square, drag = 0.5 * (forth + back) - weight, 0.5 * (forth - back)
-        for dof in np.flatnonzero(limited):
-            low, high, top = machine.force_low[dof], machine.force_high[dof], machine.top_speed[dof]
-            if (weight[:, dof] > high).any() or (weight[:, dof] < low).any():
-                k = int(np.argmax(np.maximum(weight[:, dof] - high, low - weight[:, dof])))
-                joint = machine.model.joint(int(machine.model.dof_jntid[dof])).name
-                raise PantographError(
-                    f"no timing helps: joint {joint!r} cannot hold the pose at {self.s[k]:.3f} s, "
-                    f"{weight[k, dof]:.4g} N m or N against {high if weight[k, dof] > 0 else low:.4g}"
-                )
-            for sign, limit in ((1.0, high), (-1.0, -low)):
-                # a motor loses force only in the direction it moves
-                moves = sign * at.v[:, dof] > 0
-                fall = np.where(moves, limit * np.abs(at.v[:, dof]) / top, 0.0)
-                curve = np.maximum(sign * drag[:, dof] + fall, 0.0)
-                add(sign * push[:, dof], sign * square[:, dof], limit - sign * weight[:, dof], curve)
-        if np.isfinite(machine.current):
-            used = np.flatnonzero(machine.ampere > 0)
-            if len(used) > 6:
-                raise PantographError("a battery of more than six joints: give fewer of them an ampere value")
-            for signs in np.array(np.meshgrid(*[[1.0, -1.0]] * len(used))).reshape(len(used), -1).T:
-                w = np.zeros(at.v.shape[1])
-                w[used] = signs * machine.ampere[used]
-                add(push @ w, square @ w, machine.current - weight @ w, np.maximum(drag @ w, 0.0))
-
-    def solve(self, keep: bool, at_rest: bool, about: Array | None = None) -> Array:
-        """The largest possible x (n + 1,) at the grid's times."""
-        cap = np.minimum(self.cap, 1.0) if keep else self.cap.copy()
-        b, c, a = self.b, self.c, self.a
-        if self.curved:
-            # e sqrt(x) <= e (sqrt(y) + (x - y) / (2 sqrt(y))): y the last solution, or where e alone is all
-            y0, y1 = self._tangents(about, cap)
-            y = np.concatenate(
-                [np.repeat(y0[:, None], self.half, 1), np.repeat(y1[:, None], self.half, 1)], 1
-            )
-            slope = self.e / (2.0 * np.sqrt(y))
-            b, c = b + slope, c - 0.5 * self.e * np.sqrt(y)
-            a = a.copy()
-            a[:, self.half :] += 2.0 * self.h[:, None] * slope[:, self.half :]
-        first = 0.0 if at_rest and self.moving[0] else (cap[0] if at_rest else min(1.0, cap[0]))
-        last = 0.0 if at_rest and self.moving[1] else (cap[-1] if at_rest else min(1.0, cap[-1]))
-        return _passes(a, b, c, self.h, cap, first, last, self.s)
-
-    def _tangents(self, about: Array | None, cap: Array) -> tuple[Array, Array]:
-        if about is not None:
-            floor = _FLOOR * max(float(about.max()), 1e-300)
-            y = np.maximum(about, floor)
-            return y[:-1], y[1:]
-        # first guess: where friction and the fall of force take half of what there is
-        half = self.half
-        with np.errstate(divide="ignore"):
-            room = np.where(self.e > 0, 0.5 * self.c / np.maximum(self.e, 1e-300), np.inf) ** 2
-        y0 = np.minimum(room[:, :half].min(axis=1), cap[:-1])
-        y1 = np.minimum(room[:, half:].min(axis=1), cap[1:])
-        top = max(float(np.max(np.minimum(y0, 1e6))), 1e-300)
-        return np.clip(y0, _FLOOR * top, 1e6), np.clip(y1, _FLOOR * top, 1e6)
-
-    def result(self, x: Array) -> Retimed:
-        """The clip of a solution, slowed as a whole by what it exceeds between the points of the grid."""
-        rate = np.sqrt(x)
-        steps = 2.0 * self.h / np.maximum(rate[:-1] + rate[1:], 1e-300)
-        bend = 0.5 * np.diff(x) / self.h
-
-        def at(slow: float) -> tuple[Array, Clip]:
-            t = np.concatenate([[0.0], np.cumsum(steps)]) * slow
-            return t, self._clip(t, rate / slow, bend / slow**2)
-
-        return self.slowed(at, self.s)
-
-    def slowed(self, at: Callable[[float], tuple[Array, Clip]], s: Array) -> Retimed:
-        """The clip ``at`` the least slowdown with which it holds on a grid ten times finer."""
-        slow = 1.0
-        for _ in range(30):
-            t, clip = at(slow)
-            fine = np.interp(np.arange(10 * (len(t) - 1) + 1) / 10.0, np.arange(len(t)), t)
-            now = clip.evaluate(fine)
-            last = clip.evaluate(fine[-1:], left=True)
-            for row, end in zip(now, last, strict=True):
-                row[-1:] = end
-            report = check_motion(fine, now, self.machine, keyed=clip.dofs)
-            # accelerations fall with the square of the slowdown; a force has a part that does not fall at all
-            over = [v for v in report.violations if v.kind != "position"]
-            if max((v.share for v in over), default=1.0) <= 1.0 + 5e-7:
-                break
-            powers = {"acceleration": 2.0, "jerk": 3.0}
-            slow *= max(v.share ** (1.0 / powers.get(v.kind, 1.0)) for v in over)
-        out_of_range = [v for v in report.violations if v.kind == "position"]
-        if out_of_range and out_of_range[0].value > 1e-9:
-            raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
-        return Retimed(clip, float(t[-1]), report, s, t)
-
-    def _clip(self, t: Array, rate: Array, bend: Array) -> Clip:
-        def follow(curve: Curve) -> Curve:
-            inside = np.clip(curve.times, self.s[0], self.s[-1])
-            times = np.interp(inside, self.s, t)
-            return RetimedCurve(times, curve.values, t, "hold", "hold", curve, self.s, rate, bend)
-
+    def at(slow: float) -> tuple[Array, Clip]:
+        t = np.concatenate([[0.0], np.cumsum(steps)]) * slow
         tracks: dict[str, Track] = {}
-        for name, track in self.clip.tracks.items():
-            if isinstance(track, FreeTrack):
-                raise PantographError(f"joint {name!r} is free: no machine moves it along keys")
-            tracks[name] = follow(track)
-        return Clip(self.clip.model, tracks, self.clip.q0)
+        for name, track in grid.clip.tracks.items():
+            assert isinstance(track, Curve)
+            times = np.interp(np.clip(track.times, grid.s[0], grid.s[-1]), grid.s, t)
+            tracks[name] = RetimedCurve(
+                times, track.values, t, "hold", "hold", track, grid.s, rate / slow, bend / slow**2
+            )
+        return t, Clip(grid.clip.model, tracks, grid.clip.q0)
+
+    return at
 
 
-def _passes(a: Array, b: Array, c: Array, h: Array, cap: Array, first: float, last: float, s: Array) -> Array:
-    """Backward and forward pass over rows a u + b x <= c of each piece.
-
-    Rows with a > 0 bound u from above by p + r x, those with a < 0 from below. Both passes are then chains
-    x_i = min(own_i, min_k (slope_ik x_(i+-1) + offset_ik)), which is all that runs in sequence.
-    """
-    n = len(h)
-    flat = np.abs(a) <= 1e-13 * np.maximum(np.abs(a).max(axis=1, keepdims=True), 1e-300)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        alone = np.where(flat & (b > 0), c / np.where(b > 0, b, 1.0), np.inf).min(axis=1)
-    p, r = c / np.where(flat, 1.0, a), -b / np.where(flat, 1.0, a)
-    up, down = (a > 0) & ~flat, (a < 0) & ~flat
-    half = (0.5 / h)[:, None]
-    zero = np.zeros((n, 1))
-    up_p, up_r = np.where(up, p, np.inf), np.where(up, r, 0.0)
-    down_p = np.hstack([np.where(down, p, -np.inf), zero])  # the last: x must not fall below zero
-    down_r = np.hstack([np.where(down, r, 0.0), -half])
-    own = _own_bounds(up_p, up_r, down_p, down_r, np.minimum(cap[:-1], alone))
-    # what x may be so that one of the lower bounds on u leads to the next x or below
-    slope = half + down_r
-    bound = np.isfinite(down_p) & (slope > 0)
-    gain = np.where(bound, half / np.where(bound, slope, 1.0), 0.0)
-    offset = np.where(
-        bound, -np.where(np.isfinite(down_p), down_p, 0.0) / np.where(bound, slope, 1.0), np.inf
-    )
-    reach = np.empty(n + 1)
-    reach[n] = x = min(last, cap[n])
-    for i in range(n - 1, -1, -1):
-        reach[i] = x = min(own[i], (gain[i] * x + offset[i]).min())
-    lost = np.flatnonzero(reach < -1e-9 * max(1.0, float(reach.max())))
-    if len(lost):
-        raise PantographError(f"no timing helps: the path cannot be followed at {s[lost[-1]]:.4f} s")
-    reach = np.maximum(reach, 0.0)
-    gain, offset = 1.0 + 2.0 * h[:, None] * up_r, 2.0 * h[:, None] * up_p
-    path = np.empty(n + 1)
-    path[0] = x = min(first, reach[0])
-    for i in range(n):
-        path[i + 1] = x = max(min(reach[i + 1], (gain[i] * x + offset[i]).min()), 0.0)
-    return path
+def _slowed(
+    at: Callable[[float], tuple[Array, Clip]], s: Array, corners: list[Corner], machine: Machine
+) -> Retimed:
+    """The clip ``at`` the least slowdown with which it holds on a grid ten times finer."""
+    low, slow, high = 1.0, 1.0, np.inf
+    for _ in range(40):
+        t, clip = at(slow)
+        found = report(follow(clip, t), machine, keyed=clip.dofs)
+        over = [v for v in found.violations if v.kind != "position"]
+        worst = max((v.share for v in over), default=0.0)
+        if worst <= 1.0 + _TIGHT:
+            if slow == 1.0 or slow <= low * (1.0 + 1e-5):
+                break
+            high = slow
+        else:
+            low = slow
+        if not np.isfinite(worst) or low > 100.0:
+            raise PantographError(f"no timing was found that holds between points of the path: {over[0]}")
+        slow = min(slow * max(map(_slowdown, over)), high) if worst > 1.0 else slow
+        if np.isfinite(high):
+            slow = high if high <= low * (1.0 + 1e-5) else float(np.sqrt(low * high))
+    out_of_range = [v for v in found.violations if v.kind == "position"]
+    if out_of_range and out_of_range[0].value > 1e-9:
+        raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
+    stops = tuple(Stop(c.s, float(np.interp(c.s, s, t)), c.why) for c in corners if c.why)
+    return Retimed(clip, float(t[-1]), found, s, t, stops, slow)
 
 
-def _own_bounds(up_p: Array, up_r: Array, down_p: Array, down_r: Array, x: Array) -> Array:
-    """Largest x (n,) up to ``x`` at which the bounds on u leave any u, for every piece by itself.
-
-    The gap between least upper and greatest lower line is concave in x: Newton's method from above.
-    """
-    x, rows = x.copy(), np.arange(len(x))
-    for _ in range(100):
-        upper, lower = up_p + up_r * x[:, None], down_p + down_r * x[:, None]
-        j, k = upper.argmin(axis=1), lower.argmax(axis=1)
-        gap = upper[rows, j] - lower[rows, k]
-        slope = up_r[rows, j] - down_r[rows, k]
-        narrow = gap < -1e-14 * np.maximum(np.abs(lower[rows, k]), 1.0)
-        if not narrow.any():
-            break
-        new = np.where(slope < 0, x - gap / np.where(slope < 0, slope, 1.0), -1.0)
-        step = narrow & (new < x)
-        if not step.any():
-            break
-        x = np.where(step, new, x)
-    return x
+def _slowdown(v: Violation) -> float:
+    """By how much a motion is slowed that exceeds one limit: a force has a part that does not fall at all."""
+    powers = {"velocity": 1.0, "acceleration": 2.0, "jerk": 3.0}
+    return v.share ** (1.0 / powers[v.kind]) if v.kind in powers else 1.0 + 2.0 * (v.share - 1.0)

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from ...sim.clip import Clip, FreeTrack, Motion
 from ...sim.errors import PantographError
+from .bounded import Timed, fastest, motion
 from .charts import Charts
-from .check import shares
+from .check import by_piece
 from .machine import Machine
-from .smooth_timing import even_nodes, fastest, motion, path, stretches
+from .path import Corner, Measure, corners, even_nodes, measure, path, stretches
 
 Array = NDArray[np.float64]
-_ROUNDS = 3
+_ROUNDS, _NEAR = 6, 1.002  # of cutting pieces, until limits hold to this between nodes
+_MOST = 4  # times as many pieces as at first
 
 
 class Grid(Protocol):
@@ -29,88 +31,140 @@ class Grid(Protocol):
         """a, b, c, e (n, rows) of a u + b x + e sqrt(x) <= c."""
 
 
+class Smooth(NamedTuple):
+    """``at`` a slowdown, times and clip of the fastest timing; the old times ``s`` of those, and corners."""
+
+    at: Callable[[float], tuple[Array, Clip]]
+    s: Array
+    corners: list[Corner]
+
+
 class _Stretch(NamedTuple):
-    """Times of the clip, speeds of its path at both ends or None for a pause."""
+    """Times of the clip, speeds of its path at both ends, and how it is measured; None for a pause."""
 
     nodes: Array
-    ends: tuple[float, float] | None
+    ends: tuple[float, float]
+    by: Measure | None
+
+
+class _Nodes(NamedTuple):
+    """Old and new times (n + 1,), q and v there, accelerations (n, nv) at both ends of the pieces."""
+
+    s: Array
+    t: Array
+    q: Array
+    v: Array
+    a0: Array
+    a1: Array
 
 
 def smooth(
     clip: Clip, machine: Machine, grid: Grid, x: Array, *, keep: bool, at_rest: bool, points: int
-) -> tuple[Callable[[float], tuple[Array, Clip]], Array]:
-    """A function from a slowdown to times and clip of the fastest timing, and the old times of those.
+) -> Smooth:
+    """The fastest timing with bounded jerk.
 
     ``x`` (n + 1,) is the squared rate of the timing without a limit on jerk. Pieces on which a limit is
-    exceeded are halved, up to twice. Raises PantographError for free joints, and where no timing is found.
+    exceeded are halved. Raises PantographError for free joints, and where no timing is found.
     """
     for name, track in clip.tracks.items():
         if isinstance(track, FreeTrack):
             raise PantographError(f"joint {name!r} is free: no machine moves it along keys")
-    parts = stretches(clip, grid.s, grid.still)
+    pauses = _pauses(grid)
+    found = corners(clip, np.isfinite(machine.jerk) & clip.dofs, pauses, keep=keep)
+    rows = _stretches(clip, found, pauses, x, at_rest, points)
+    back = [c.s for c in found if c.back]
+    most = _MOST * sum(len(row.nodes) for row in rows)
+    known: list[Timed | None] = [None] * len(rows)
+    for _ in range(_ROUNDS):
+        known = [_timed(clip, machine, grid, *pair, back, keep) for pair in zip(rows, known, strict=True)]
+        now = _stitched(clip, machine, rows, known)
+        at = _quintics(clip, now)
+        coarse = now.s[:-1][by_piece(machine, *at(1.0)) > _NEAR]
+        if not len(coarse) or len(now.s) + len(coarse) > most:
+            break
+        rows = [row if row.by is None else row._replace(nodes=_halved(row.nodes, coarse)) for row in rows]
+    return Smooth(at, now.s, found)
+
+
+def _pauses(grid: Grid) -> list[tuple[float, float]]:
+    """Times between which nothing moves."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], grid.still.astype(int), [0]])))
+    return [(float(grid.s[a]), float(grid.s[b])) for a, b in edges.reshape(-1, 2)]
+
+
+def _stretches(
+    clip: Clip,
+    found: list[Corner],
+    pauses: list[tuple[float, float]],
+    x: Array,
+    at_rest: bool,
+    points: int,
+) -> list[_Stretch]:
+    parts = stretches(clip, found, pauses)
     total = sum(b - a for a, b, moves in parts if moves)
-    rates = np.sqrt(x[[0, -1]]) * np.linalg.norm(clip.evaluate([clip.start, clip.end], left=False).v, axis=1)
-    rates[1] = np.sqrt(x[-1]) * np.linalg.norm(clip.evaluate(clip.end, left=True).v)
+    ends = clip.evaluate(clip.start).v, clip.evaluate(clip.end, left=True).v
+    first, last = (float(np.sqrt(x[k]) * np.linalg.norm(ends[k])) for k in (0, -1))
     rows = []
     for a, b, moves in parts:
         if not moves:
-            rows.append(_Stretch(np.array([a, b]), None))
+            rows.append(_Stretch(np.array([a, b]), (0.0, 0.0), None))
             continue
-        first = 0.0 if at_rest or a > clip.start else float(rates[0])
-        last = 0.0 if at_rest or b < clip.end else float(rates[1])
-        rows.append(
-            _Stretch(even_nodes(clip, a, b, max(24, round(points / 8 * (b - a) / total))), (first, last))
+        speeds = (
+            0.0 if at_rest or a > clip.start else first,
+            0.0 if at_rest or b < clip.end else last,
         )
-    for _ in range(_ROUNDS):
-        s, t, now = _stitched(clip, machine, grid, rows, keep)
-        at = _quintics(clip, t, now)
-        coarse = s[:-1][_by_piece(machine, *at(1.0)) > 1.005]
-        if not len(coarse):
-            break
-        rows = [row if row.ends is None else row._replace(nodes=_halved(row.nodes, coarse)) for row in rows]
-    return at, s
+        many = max(24, round(points / 8 * (b - a) / total))
+        by = measure(clip, a, b, found)
+        rows.append(_Stretch(even_nodes(clip, by, many), speeds, by))
+    return rows
 
 
-def _stitched(
-    clip: Clip, machine: Machine, grid: Grid, rows: list[_Stretch], keep: bool
-) -> tuple[Array, Array, Motion]:
-    """Old times, new times and motion at the nodes of all stretches, one after the other."""
-    times, nodes, moves = [np.zeros(1)], [rows[0].nodes[:1]], list[Motion]()
-    for row in rows:
-        if row.ends is None:
-            t = row.nodes - row.nodes[0]
-            now = Motion(clip.evaluate(row.nodes).q, *np.zeros((2, 2, clip.model.nv)))
+def _timed(
+    clip: Clip,
+    machine: Machine,
+    grid: Grid,
+    row: _Stretch,
+    known: Timed | None,
+    back: list[float],
+    keep: bool,
+) -> Timed | None:
+    """The timing of a stretch, from the one ``known`` over fewer nodes; None for a pause."""
+    if row.by is None or (known is not None and len(known.along.s) == len(row.nodes)):
+        return known
+    return fastest(path(clip, row.by, row.nodes, back), machine, grid.rows, known, ends=row.ends, keep=keep)
+
+
+def _stitched(clip: Clip, machine: Machine, rows: list[_Stretch], known: list[Timed | None]) -> _Nodes:
+    """Motion at the nodes of all stretches, one after the other."""
+    jerky, nv = np.isfinite(machine.jerk), clip.model.nv
+    s, t, q, v = [rows[0].nodes[:1]], [np.zeros(1)], list[Array](), list[Array]()
+    a0, a1 = list[Array](), list[Array]()
+    for row, timing in zip(rows, known, strict=True):
+        if timing is None:
+            new, here = row.nodes - row.nodes[0], clip.evaluate(row.nodes).q
+            part = (here, np.zeros((2, nv)), np.zeros((1, nv)), np.zeros((1, nv)))
         else:
-            along = path(clip, row.nodes)
-            timing = fastest(along, machine, grid.rows, ends=row.ends, keep=keep)
-            t, now = timing.t, motion(along, clip, timing)
-        moves.append(Motion(*(part[1 if moves else 0 :] for part in now)))
-        times.append(times[-1][-1] + t[1:])
-        nodes.append(row.nodes[1:])
-    joined = Motion(*(np.concatenate(part) for part in zip(*moves, strict=True)))
-    return np.concatenate(nodes), np.concatenate(times), joined
+            new, part = timing.t, motion(clip, timing, jerky)
+        first = 1 if q else 0
+        s.append(row.nodes[1:])
+        t.append(t[-1][-1] + new[1:])
+        q.append(part[0][first:])
+        v.append(part[1][first:])
+        a0.append(part[2])
+        a1.append(part[3])
+    return _Nodes(*(np.concatenate(x) for x in (s, t, q, v, a0, a1)))
 
 
-def _quintics(clip: Clip, t: Array, now: Motion) -> Callable[[float], tuple[Array, Clip]]:
-    """Times and the clip through motion at times t (n,), by how much it is slowed."""
+def _quintics(clip: Clip, now: _Nodes) -> Callable[[float], tuple[Array, Clip]]:
+    """Times and the clip through motion at nodes, by how much it is slowed."""
     charts = Charts(clip.model)
 
     def at(slow: float) -> tuple[Array, Clip]:
-        a = now.a / slow**2
-        new = charts.clip(t * slow, now.q, now.v / slow, a[:-1], a[1:], clip)
-        return t * slow, Clip(clip.model, {name: new.tracks[name] for name in clip.tracks}, clip.q0)
+        t, square = now.t * slow, slow**2
+        new = charts.clip(t, now.q, now.v / slow, now.a0 / square, now.a1 / square, clip)
+        return t, Clip(clip.model, {name: new.tracks[name] for name in clip.tracks}, clip.q0)
 
     return at
-
-
-def _by_piece(machine: Machine, t: Array, clip: Clip) -> Array:
-    """Largest share (n,) of a limit in use on each piece between times t (n + 1,)."""
-    fine = np.interp(np.arange(10 * (len(t) - 1)) / 10.0, np.arange(len(t)), t)
-    out = np.zeros(len(t) - 1)
-    for use in shares(fine, clip.evaluate(fine), machine, keyed=clip.dofs):
-        if use.kind != "position":
-            out = np.maximum(out, use.share.reshape(len(out), 10).max(axis=1))
-    return out
 
 
 def _halved(nodes: Array, coarse: Array) -> Array:

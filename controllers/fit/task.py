@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import lookup, names_of
+from ...models import joint_names, lookup, names_of
 from ...sim.clip import Clip
 from ...sim.kinds import FREE
 from ...sim.plan import Plan, make_plan
@@ -33,24 +33,41 @@ class Task(NamedTuple):
 
 
 def task_of(scene: Scene, **given: Any) -> Task:
-    """The task of a scene; what is ``given`` and not None or empty goes before its table [fit].
+    """The task of a scene; what is ``given`` and not None goes before its table [fit].
 
-    Free joints have no drive. Raises PantographError for names of no joint or site, and for limits that are
-    not positive.
+    Limits by joint go before those of the scene joint by joint; under the name "" they stand for all joints
+    that are not named. Free joints have no drive. Raises PantographError for names of no joint or site, and
+    for limits that are not positive.
     """
     item = scene.fit or FitItem()
-    said = {**dict(item), **{word: value for word, value in given.items() if value}}
+    said = {**dict(item), **{word: value for word, value in given.items() if value is not None}}
     plan = make_plan(_tracked(make_plan(scene)))
     model = plan.problem.model
+    driven = _driven(model, said["passive"])
     able = machine(
         model,
-        driven=_driven(model, said["passive"]),
-        current=said["current"] or math.inf,
-        **{word: said[word] for word in LIMITS},
+        driven=driven,
+        current=math.inf if said["current"] is None else said["current"],
+        **{word: _by_joint(model, driven, said[word], getattr(item, word)) for word in LIMITS},
     )
     phases = tuple(Phase(p.start, p.stop, tuple(p.sites), p.friction, p.ground) for p in item.phases)
     words = {w: said[w] for w in ("effort", "deviation", "step", "tolerance", "at_rest")}
     return Task(plan, plan.problem.clip, able, tuple(said["hard"]), phases, words)
+
+
+def _by_joint(model: mujoco.MjModel, driven: NDArray[np.bool_], given: Any, scene: Any) -> Any:
+    """A limit of all driven joints and those of some, as limits by joint."""
+    if not isinstance(given, dict) or given is scene:
+        return given
+    named = {name: value for name, value in given.items() if name}
+    if set(given) == {""}:
+        return given[""]
+    rest = given.get("", scene)
+    if not isinstance(rest, dict):
+        joints = joint_names(model)
+        every = () if rest is None else [joints[j] for j in np.unique(model.dof_jntid[driven])]
+        rest = dict.fromkeys(every, rest)
+    return {**rest, **named}
 
 
 def _tracked(plan: Plan) -> Scene:
