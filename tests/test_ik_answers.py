@@ -23,8 +23,9 @@ from pantograph.sim.ik import (
     Spread,
     solve,
 )
-from pantograph.sim.ik.chains import machine as machines
 from pantograph.sim.ik.problem import Problem
+from pantograph.sim.ik.proofs.gaps import goal_gap
+from pantograph.sim.ik.space import Space
 from strategies import seeds
 
 Z = (0, 0, 1)
@@ -52,21 +53,34 @@ def test_a_race_makes_the_starts_it_is_given_and_counts_them(count):
     assert raced.q[0, 0] == pytest.approx(3.0, abs=1e-8)
 
 
+def test_machine_code_is_used_at_once_never_or_when_it_pays():
+    """A structure that was never asked for before: the first two answers are of one code, or of another."""
+    length = 0.3 + 1e-3 * np.random.default_rng().random()
+    model = ik_cases.planar_chain([1.0, 0.8, length, 0.5], [(-2, 2)] * 4)
+    problem = Problem(model, [Position("tip", [1.2, 0.9, 0])], Space(model))
+    for compiled, made in ((False, False), (None, False), (True, True)):
+        assert solve(model, problem.goals, compiled=compiled).solved
+        assert (problem.prepared() is not None) == made
+        problem = problem.only(problem.goals)
+    assert Problem(model, problem.goals, Space(model), code=False).prepared(build=True) is None
+    numpy, machine = (solve(model, problem.goals, compiled=compiled).q for compiled in (False, True))
+    np.testing.assert_allclose(numpy, machine, rtol=0, atol=1e-7)
+    assert (numpy != machine).any()
+
+
 def _hard_pose(index):
     case = ik_cases.reachable_at_limit(np.random.default_rng([index, 3]))
     return case.model, case.goals
 
 
-@pytest.mark.parametrize("code", ["numpy", "machine"])
-def test_the_seed_decides_the_starts_and_the_answer_bit_for_bit(code, monkeypatch):
-    if code == "numpy":
-        monkeypatch.setattr(Problem, "prepared", lambda self, **_: None)
-    else:
-        monkeypatch.setattr(machines, "_expected", lambda problem: -1.0)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_seed_decides_the_starts_and_the_answer_bit_for_bit(compiled):
     differ = 0
     for index in range(12):
         model, goals = _hard_pose(index)
-        one, same, other = (solve(model, goals, seed=seed, q0=model.jnt_range[:, 0]) for seed in (4, 4, 5))
+        one, same, other = (
+            solve(model, goals, seed=seed, q0=model.jnt_range[:, 0], compiled=compiled) for seed in (4, 4, 5)
+        )
         np.testing.assert_array_equal(one.q, same.q)
         assert (one.iterations, one.restarts, str(one.verdict)) == (
             same.iterations, same.restarts, str(same.verdict),
@@ -222,6 +236,9 @@ def test_residuals_have_the_units_of_their_joints():
     slide, hinge = solve(model, [JointValue("j0", 1.4), JointValue("j3", 2.3)]).residuals
     assert (slide.position, slide.rotation) == (pytest.approx(0.4), 0.0)
     assert (hinge.position, hinge.rotation) == (0.0, pytest.approx(0.3))
+    gap = goal_gap(Problem(model, [JointValue("j0", 1.4)], Space(model)), JointValue("j0", 1.4), model.qpos0)
+    assert (gap.position, gap.rotation) == (pytest.approx(0.4), 0.0)
+    assert solve(model, [JointValue("j0", 0.3), JointValue("j0", 0.5)]).verdict.bound == pytest.approx(0.2)
     verdict = solve(model, JointValue("j0", 1.4)).verdict
     assert (verdict.position, verdict.rotation) == (pytest.approx(0.4), 0.0)
     goals = [JointValue("j0", 0.0), JointValue("j1", 0.3), Spread(("j0", "j1"), weight=1.0)]
@@ -267,9 +284,10 @@ def test_every_row_has_its_own_tolerance():
         solve(model, Posture([0.3, 0.5, 0.7], tolerance=(1e-6, 0.4)))
     turned = Pose("tip", [2.7, 0, 0], [1, 0, 0, 0], tolerance=(1e-6,) * 3 + (0.5,) * 3)
     verdict = solve(model, turned).verdict
-    assert (verdict.kind, verdict.proved) == ("out of reach", True)  # 0.3 m: less than the room to turn
+    assert (verdict.kind, verdict.proved) == ("out of reach", True)
+    assert verdict.bound == pytest.approx(0.3)  # less than the room to turn
     free = Pose("tip", [2.7, 0, 0], [1, 0, 0, 0], tolerance=(1e-6,) * 3 + (np.inf,) * 3)
-    assert solve(model, free).verdict.proved
+    assert solve(model, free).verdict.bound == pytest.approx(0.3)
     loose = Orientation("tip", ik_cases.quat_z(0.3), tolerance=(0.2, 1e-6, 1e-6))
     tilted = rotations.multiply(np.array(ik_cases.quat_z(0.3)), rotations.exp([0.15, 0, 0]))
     assert solve(model, Orientation("tip", tilted, tolerance=(0.2, 1e-6, 1e-6))).solved

@@ -40,6 +40,7 @@ class Problem:
         tolerance (m,): of every row.
         moved (nv,): freedoms that may change.
         wished: goals beside these that are met as well as these allow, if any.
+        code: whether machine code is used: from the first (True), never (False), or when it pays (None).
     """
 
     def __init__(
@@ -50,7 +51,9 @@ class Problem:
         *,
         joints: Sequence[str] | None = None,
         kinematics: Kinematics | None = None,
+        code: bool | None = None,
     ):
+        self.code = code
         self.wished: Problem | None = None
         if not goals:
             raise ModelError("inverse kinematics needs at least one goal")
@@ -106,8 +109,10 @@ class Problem:
 
     def prepared(self, *, build: bool = False) -> Prepared | None:
         """Machine code for this problem, if there is any by now; with `build`, made where it pays."""
-        if self._prepared is None and self.name and (build or not self._looked):
-            self._prepared, self._looked = prepared(self, self.name, build=build), True
+        if self._prepared is None and self.code is not False and self.name and (build or not self._looked):
+            at_once = self.code is True
+            self._prepared = prepared(self, self.name, build=build or at_once, at_once=at_once)
+            self._looked = True
         return self._prepared
 
     def beside(self, q: Array) -> Rows:
@@ -148,7 +153,7 @@ class Problem:
 
     def only(self, goals: Sequence[Goal]) -> Problem:
         """The same model and freedoms with other goals."""
-        out = Problem(self.model, goals, self.space, kinematics=self.kinematics)
+        out = Problem(self.model, goals, self.space, kinematics=self.kinematics, code=self.code)
         out.moved &= self.moved
         return out
 
@@ -171,7 +176,8 @@ class Problem:
 
     def without_limits(self) -> Problem:
         """The same goals without joint limits."""
-        out = Problem(self.model, self.goals, Space(self.model, limits=False), kinematics=self.kinematics)
+        space = Space(self.model, limits=False)
+        out = Problem(self.model, self.goals, space, kinematics=self.kinematics, code=self.code)
         out.moved &= self.moved
         return out
 
@@ -187,20 +193,22 @@ _EARLIER: dict[object, Asked] = {}
 _MOST_EARLIER = 32
 
 
-def asked(model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None) -> Asked:
+def asked(
+    model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None, code: bool | None = None
+) -> Asked:
     """The question of `solve`.
 
     What follows from the model and from the names in the goals is taken over from an earlier question that
     differed in targets alone, as along a track or live.
     """
     if not all(is_known(goal) for goal in goals):
-        return _asked(model, goals, joints)
+        return _asked(model, goals, joints, code)
     limits = model.jnt_range.tobytes()
     given = [(words(g), g.weight, g.tolerance) for g in goals]
-    key = repr((id(model), given, joints)), limits, *numbers(model)
+    key = repr((id(model), given, joints, code)), limits, *numbers(model)
     earlier = _EARLIER.get(key)
     if earlier is None:
-        earlier = _asked(model, goals, joints)
+        earlier = _asked(model, goals, joints, code)
         _ = earlier.judged.name  # once for all
         while len(_EARLIER) >= _MOST_EARLIER:
             _EARLIER.pop(next(iter(_EARLIER)), None)
@@ -212,8 +220,10 @@ def asked(model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | 
     return Asked(judged, wished)
 
 
-def _asked(model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None) -> Asked:
-    problem = Problem(model, goals, Space(model), joints=joints)
+def _asked(
+    model: mujoco.MjModel, goals: Sequence[Goal], joints: Sequence[str] | None, code: bool | None
+) -> Asked:
+    problem = Problem(model, goals, Space(model), joints=joints, code=code)
     hard = [g for g in goals if g.weight is None]
     soft = [g for g in goals if g.weight is not None]
     if not hard or not soft:

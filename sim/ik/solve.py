@@ -38,11 +38,13 @@ def solve(
     restarts: int = 200,
     seed: int = 0,
     all: bool = False,
+    compiled: bool | None = None,
 ) -> Solution:
     """Configuration of `model` that meets `goals`, always within joint limits, with a verdict.
 
     Questions that differ in targets, weights or limits alone share one piece of machine code, compiled
-    when NumPy has taken as long as that would, and kept on disk; the answers are the same to rounding.
+    when NumPy has taken as long as that would, and kept on disk; the answers are the same to rounding
+    (bit for bit with `compiled`).
 
     Args:
         model: constant; its active connect, weld and joint equalities that the goals touch hold, too.
@@ -54,16 +56,17 @@ def solve(
             of `obstacles`; default near, or clear where there are obstacles.
         obstacles: pairs of geoms to keep apart as far as the goals allow.
         restarts: random starts at most, besides q0 and mid-range; 0 for none.
-        seed: of the random starts, not negative. The same seed gives the same starts, and the same answer bit
-            for bit from the same code (machine code, or NumPy).
+        seed: of the random starts, not negative.
         all: list distinct solutions, and whether these are all (`Solution.complete`).
+        compiled: True for machine code from the first question on, False for NumPy alone: the same question
+            then has the same answer bit for bit. Default: machine code when it pays.
 
     Raises ModelError for goals or names that do not fit the model.
     """
     begin = time.perf_counter()
     goals = (goals,) if isinstance(goals, Goal) else tuple(goals)
     _check(goals, restarts, seed)
-    judged, wished = asked(model, goals, joints)
+    judged, wished = asked(model, goals, joints, compiled)
     start = judged.space.check(model.qpos0 if q0 is None else q0)
     kind = chosen(prefer, obstacles)
     prefers = preference(kind, judged, start, obstacles)

@@ -362,11 +362,12 @@ _CASES: dict[str, _Case] = {}
 _MOST_CASES = 200
 
 
-def prepared(problem: Problem, name: str, *, build: bool = False) -> Prepared | None:
+def prepared(problem: Problem, name: str, *, build: bool = False, at_once: bool = False) -> Prepared | None:
     """The machine of a problem, when it is worth having.
 
     A structure compiled before comes from the disk. With `build`, a new one is compiled once as many seconds
     were `charge`d to it in NumPy as compiling will take: whatever follows, this costs at most twice the best.
+    With `at_once` it does not wait for that.
     """
     case = _CASES.get(name)
     if case is None:
@@ -375,7 +376,7 @@ def prepared(problem: Problem, name: str, *, build: bool = False) -> Prepared | 
         case = _CASES[name] = _Case()
         with suppress(_Absent):
             case.machine = compiled(problem, name, cached=True)
-    if build and case.machine is None and case.spent > _expected(problem):
+    if build and case.machine is None and (at_once or case.spent > _expected(problem)):
         case.machine = compiled(problem, name)
     return None if case.machine is None else Prepared(case.machine, case.machine.arguments(problem))
 
