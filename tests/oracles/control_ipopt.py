@@ -6,7 +6,7 @@ import numpy as np
 
 def formulate(law):
     """A solver (x0, reference states, reference forces, guess) -> (forces, cost) of an NMPC's problem."""
-    model, n, m, h = law.model, law.n, len(law.inputs), ca.SX.sym("h")
+    model, n, m, h, c = law.model, law.n, len(law.inputs), ca.SX.sym("h"), law.shooting.weights
     nv = model.nv
     x, u = ca.SX.sym("x", 2 * nv), ca.SX.sym("u", m)
     tau = ca.SX.zeros(nv)
@@ -27,21 +27,20 @@ def formulate(law):
         ca.MX.sym(*a) for a in (("x0", 2 * nv), ("Xr", 2 * nv, n + 1), ("Ur", m, n), ("h", 1, n))
     )
     dx, du = X - Xr, U - Ur
-    cost = ca.dot(ca.DM(law.Q).T @ dx[:, :-1] ** 2 + ca.DM(law.R).T @ du**2, H) / law.step
-    cost += dx[:, -1].T @ ca.DM(law.final) @ dx[:, -1]
-    for dof in np.flatnonzero(np.isfinite(law.q_high)):
+    cost = ca.dot(ca.DM(c.Q).T @ dx[:, :-1] ** 2 + ca.DM(c.R).T @ du**2, H) / law.step
+    cost += dx[:, -1].T @ ca.DM(c.final) @ dx[:, -1]
+    for dof in np.flatnonzero(np.isfinite(c.q_high)):
         over = (
-            ca.fmax(X[int(dof), :] - law.q_high[dof], 0) ** 2
-            + ca.fmax(law.q_low[dof] - X[int(dof), :], 0) ** 2
+            ca.fmax(X[int(dof), :] - c.q_high[dof], 0) ** 2 + ca.fmax(c.q_low[dof] - X[int(dof), :], 0) ** 2
         )
-        cost += law.soft[dof] * ca.sum2(over)
+        cost += c.soft[dof] * ca.sum2(over)
     g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U, H))
     problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur, H), "f": cost, "g": g}
     options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
     solver = ca.nlpsol("mpc", "ipopt", problem, options)
     free = np.full(2 * nv * (n + 1), np.inf)
-    low = np.concatenate([-free, np.tile(law.low, n)])
-    high = np.concatenate([free, np.tile(law.high, n)])
+    low = np.concatenate([-free, np.tile(c.low, n)])
+    high = np.concatenate([free, np.tile(c.high, n)])
 
     def solve(x0, ref, guess_x, guess_u):
         p = np.concatenate([x0, ref.x.ravel(), ref.u.ravel(), ref.h])
