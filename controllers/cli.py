@@ -107,8 +107,8 @@ def _tables(result: Any) -> tuple[Table, Table]:
     count = len(result.disturbances)
     well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
     well.title = f"tracked joints: errors (rad, m), settling (s); worst of {count} disturbed runs"
-    cost = _columns("law", "effort", "work J", "saturated", "build ms", "tick us", "99 % us", "of period")
-    cost.title = f"what it takes; ticks after the first build, period {result.period * 1e3:g} ms"
+    cost = _columns("law", "effort", "work J", "at limit", "build ms", "tick us", "99 % us", "of T")
+    cost.title = f"what it takes; processor time of ticks, period T = {result.period * 1e3:g} ms"
     for row in result.rows:
         f, name = row.nominal, row.variant.name
         settled = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,17 +13,19 @@ from .linear import LinearSystem
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 _RANK = 1e-9  # singular values below this fraction of the largest count as zero
+_EDGE = 1e-9  # poles so near the edge of stability lie on it
 
 
 @dataclass(frozen=True)
 class Mode:
     """A pole, with its natural ``frequency`` [rad/s] and ``damping`` ratio (of a discrete pole: of the
-    continuous one it samples; NaN without a period), and whether it dies out."""
+    continuous one it samples; NaN without a period), whether it dies out, and ``of`` which state mostly."""
 
     pole: complex
     frequency: float
     damping: float
     stable: bool
+    of: str = ""
 
     @property
     def damped(self) -> float:
@@ -31,10 +33,11 @@ class Mode:
         return self.pole.real
 
     def __str__(self) -> str:
+        of = f" of {self.of}" if self.of else ""
         if not np.isfinite(self.frequency):
-            return f"{self.pole:.4g} ({'stable' if self.stable else 'unstable'})"
+            return f"{self.pole:.4g}{of} ({'stable' if self.stable else 'unstable'})"
         stable = "dies out" if self.stable else "does not die out"
-        return f"{self.frequency:.4g} rad/s (damping {self.damping:.3g}, {stable})"
+        return f"{self.frequency:.4g} rad/s{of} (damping {self.damping:.2f}, {stable})"
 
 
 def modes(A: ArrayLike, *, period: float | None = None) -> tuple[Mode, ...]:
@@ -47,8 +50,8 @@ def modes(A: ArrayLike, *, period: float | None = None) -> tuple[Mode, ...]:
 def _mode(pole: complex, *, discrete: bool, period: float | None = None) -> Mode:
     if not discrete:
         size = abs(pole)
-        return Mode(pole, size, -pole.real / size if size else 1.0, pole.real < 0)
-    stable = abs(pole) < 1
+        return Mode(pole, size, -pole.real / size if size else 1.0, pole.real < -_EDGE * min(size, 1.0))
+    stable = abs(pole) < 1.0 - _EDGE
     if period is None or pole == 0:
         return Mode(pole, np.nan, np.nan, stable)
     s = np.log(pole) / period
@@ -56,9 +59,15 @@ def _mode(pole: complex, *, discrete: bool, period: float | None = None) -> Mode
 
 
 def unsteerable_modes(
-    A: Array, B: Array, *, discrete: bool = False, period: float | None = None
+    A: Array,
+    B: Array,
+    *,
+    discrete: bool = False,
+    period: float | None = None,
+    states: tuple[str, ...] = (),
 ) -> tuple[Mode, ...]:
-    """Modes that no input moves, by the test of Popov, Belevitch and Hautus: rank (A - p I, B) < n.
+    """Modes that no input moves, by the test of Popov, Belevitch, Hautus: rank (A - p I, B) < n. With names
+    of ``states``, positions first, each says where it is seen most.
 
     Repeated poles that rounding splits are judged as one: the test uses every pole with a tolerance.
     """
@@ -67,17 +76,24 @@ def unsteerable_modes(
     unit = B / max(float(np.linalg.norm(B, 2)), 1e-300) * scale
     found = []
     for pole in linalg.eigvals(A):
-        block = np.hstack([A - pole * np.eye(n), unit])
-        if np.linalg.svd(block, compute_uv=False)[-1] <= _RANK * scale:
-            found.append(_mode(complex(pole), discrete=discrete or period is not None, period=period))
+        left, sizes, _ = np.linalg.svd(np.hstack([A - pole * np.eye(n), unit]))
+        if sizes[-1] <= _RANK * scale:
+            mode = _mode(complex(pole), discrete=discrete or period is not None, period=period)
+            most = int(np.argmax(np.abs(left[:, -1]) * (np.arange(n) < n // 2 if states else 1.0)))
+            found.append(replace(mode, of=states[most]) if states else mode)
     return tuple(found)
 
 
 def hidden_modes(
-    A: Array, C: Array, *, discrete: bool = False, period: float | None = None
+    A: Array,
+    C: Array,
+    *,
+    discrete: bool = False,
+    period: float | None = None,
+    states: tuple[str, ...] = (),
 ) -> tuple[Mode, ...]:
     """Modes that no output C x shows: the unsteerable ones of the dual system."""
-    return unsteerable_modes(A.T, C.T, discrete=discrete, period=period)
+    return unsteerable_modes(A.T, C.T, discrete=discrete, period=period, states=states)
 
 
 @dataclass(frozen=True)
@@ -94,27 +110,27 @@ class Verdict:
 
 def controllability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode."""
-    stuck = unsteerable_modes(system.A, system.B, period=system.period)
+    stuck = unsteerable_modes(system.A, system.B, period=system.period, states=system.states)
     by = ", ".join(system.inputs)
     return _verdict("controllable", f" by {by}", stuck, f"not controllable by {by}: they cannot move ")
 
 
 def stabilisability(system: LinearSystem) -> Verdict:
     """Whether the inputs can move every mode that does not die out by itself."""
-    stuck = unsteerable_modes(system.A, system.B, period=system.period)
+    stuck = unsteerable_modes(system.A, system.B, period=system.period, states=system.states)
     more = ": what no input moves dies out" if stuck else ""
     return _verdict("stabilisable", more, _lasting(stuck), "not stabilisable: no input moves ")
 
 
 def observability(system: LinearSystem, C: ArrayLike) -> Verdict:
     """Whether outputs C x (o, n) show every mode."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period)
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period, states=system.states)
     return _verdict("observable", "", unseen, "not observable: nothing measured shows ")
 
 
 def detectability(system: LinearSystem, C: ArrayLike) -> Verdict:
     """Whether outputs C x (o, n) show every mode that does not die out by itself."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period)
+    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period, states=system.states)
     more = ": what nothing shows dies out" if unseen else ""
     return _verdict("detectable", more, _lasting(unseen), "not detectable: nothing measured shows ")
 

@@ -64,6 +64,9 @@ def locus(system: LinearSystem, K: ArrayLike, *, most: float = 3.0) -> Figure:
     else:
         turn = np.exp(2j * np.pi * np.linspace(0, 1, 200))
         ax.plot(turn.real, turn.imag, color="grey", lw=0.8)
+        near = np.concatenate([poles[0], poles[199], [-1.05, 1.05]])  # branches may leave for far away
+        ax.set_xlim(near.real.min() - 0.1, near.real.max() + 0.1)
+        ax.set_ylim(-max(1.1, 1.1 * np.abs(near.imag).max()), max(1.1, 1.1 * np.abs(near.imag).max()))
         ax.set_aspect("equal")
     ax.set_xlabel("real part [1/s]" if system.period is None else "real part")
     ax.set_ylabel("imaginary part [rad/s]" if system.period is None else "imaginary part")
