@@ -64,15 +64,26 @@ class HardCase:
 
     def error(self, motion: Motion, model: mujoco.MjModel) -> float:
         """Largest difference to the expected value over `scale`; NaN where the end was not reached."""
+        return self._apart(self._observed(motion, model), np.array(self.expected))
+
+    def apart(self, motion: Motion, other: Motion, model: mujoco.MjModel) -> float:
+        """As `error`, between two motions."""
+        return self._apart(self._observed(motion, model), self._observed(other, model))
+
+    def _apart(self, value: Array, other: Array) -> float:
+        return float(np.max(np.abs(value - other) / np.array(self.scale)))
+
+    def _observed(self, motion: Motion, model: mujoco.MjModel) -> Array:
+        """What is known at the end; NaN where the end was not reached."""
         if not motion.finite:
-            return float("nan")
-        value = motion.q[-1] if self.observe == "qpos" else motion.v[-1]
+            return np.full(len(self.expected), np.nan)
         if self.observe == "com":
             data = mujoco.MjData(model)
             data.qpos[:] = motion.q[-1]
             mujoco.mj_kinematics(model, data)
-            value = data.xipos[1]
-        return float(np.max(np.abs(value - np.array(self.expected)) / np.array(self.scale)))
+            return np.array(data.xipos[1])
+        value: Array = motion.q[-1] if self.observe == "qpos" else motion.v[-1]
+        return value
 
 
 def _mass(mass: float, *, x: float = 0.0, z: float = -1.0, inertia: str = _POINT) -> str:

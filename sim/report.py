@@ -14,20 +14,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import mujoco
 
 from .hard_cases import HARD_CASES, HardCase
+from .recording import check_writable
 from .scene_work import is_free, scene_case, scene_references, scene_runners
-from .work_precision import (
-    Case,
-    Motion,
-    Reference,
-    Row,
-    Runner,
-    mujoco_reference,
-    runners,
-    smooth_or_none,
-    smooth_reference,
-    sweep,
-    trajectory_error,
-)
+from .work_precision import SURE, Case, Motion, Reference, Row, Runner, by_method, sweep, trajectory_error
+from .work_runners import mujoco_reference, runners, smooth_or_none, smooth_reference
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,12 +26,14 @@ if TYPE_CHECKING:
     from .scene.schema import Scene
 
 Error: TypeAlias = Callable[[Motion], float]
+Apart: TypeAlias = Callable[[Motion, Motion], float]
 
 ENGINES = ("smooth", "mujoco", "scipy")
 TARGETS = (1e-3, 1e-6, 1e-9)
 """Errors [rad, m] that the recommendation is about."""
 
 
+_KEYED = "every joint is keyed: poses are those of the keys, to rounding, and nothing is integrated"
 RIVALS = ("mujoco", "contact")
 """Engines whose best setting a recommendation is compared with."""
 
@@ -54,11 +46,13 @@ class Yardstick:
         source: in words.
         uncertainty: error of the reference itself; errors below it say nothing.
         engine: whose rows; "" for all.
+        sure_until: when the reference's own error first exceeds 1e-3 rad or m [s]; infinite when never.
     """
 
     source: str
     uncertainty: float
     engine: str = ""
+    sure_until: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +88,8 @@ class Report:
 
     def recommendation(self) -> str:
         """What to take for each of TARGETS, and what that saves against MuJoCo's best setting."""
+        if not self.rows:
+            return "Nothing to choose: no method is at work."
         sentences = []
         for target in TARGETS:
             best = self.cheapest(target)
@@ -109,7 +105,19 @@ class Report:
             elif best.engine not in RIVALS and any(row.engine in RIVALS for row in self.rows):
                 text += "; MuJoCo's integrators do not reach it at the steps tried"
             sentences.append(text + ".")
-        return "\n".join([*sentences, *_stiffness(self.rows)])
+        return "\n".join([*sentences, *_stiffness(self.rows), *self._unsure()])
+
+    def _unsure(self) -> list[str]:
+        """Where references stop to say where a motion goes, a sentence each."""
+        sentences = []
+        for y in self.yardsticks:
+            if math.isfinite(y.sure_until):
+                whose = f" of the {y.engine} engine" if y.engine else ""
+                sentences.append(
+                    f"Beyond {y.sure_until:.3g} s the reference{whose} is not sure to {SURE:g}: errors grow "
+                    "fast there (chaos, impacts). Ask for less time, or for statistics over many starts."
+                )
+        return sentences
 
     def table(self) -> list[dict[str, Any]]:
         """The rows as dictionaries."""
@@ -117,48 +125,9 @@ class Report:
 
     def figure(self) -> Figure:
         """Error against processor time and against evaluations, a line for each method."""
-        from matplotlib import colormaps
-        from matplotlib.figure import Figure
+        from .report_figure import draw
 
-        figure = Figure(figsize=(11, 5), layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
-        shades = {
-            "smooth": "Blues",
-            "mujoco": "Reds",
-            "contact": "Reds",
-            "scipy": "Greens",
-            "torch": "Purples",
-        }
-        markers = "osv^<>DPX*dph"
-        methods = _by_method(self.rows)
-        for n, (key, rows) in enumerate(methods.items()):
-            kin = [other for other in methods if other[0] == key[0]]
-            shade = 0.4 + 0.6 * (kin.index(key) + 1) / len(kin)
-            seen = [row for row in rows if row.error > 0]
-            style = {
-                "color": colormaps[shades[key[0]]](shade),
-                "marker": markers[n % len(markers)],
-                "markersize": 4,
-                "linestyle": "-" if key[2] == "tolerance" else ":",
-                "linewidth": 1,
-            }
-            label = f"{key[0]} {key[1]}" + (" (adaptive)" if key[2] == "tolerance" else "")
-            axes[0].loglog(
-                [1e3 * row.cpu_s for row in seen], [row.error for row in seen], label=label, **style
-            )
-            axes[1].loglog([row.evaluations for row in seen], [row.error for row in seen], **style)
-        for ax, what in zip(
-            axes, ("processor time [ms]", "evaluations of the equations of motion"), strict=True
-        ):
-            ax.axhspan(1e-17, max([1e-17, *(y.uncertainty for y in self.yardsticks)]), color="0.93", zorder=0)
-            ax.set_xlabel(what)
-            ax.grid(alpha=0.3)
-        errors = [row.error for row in self.rows if row.error > 0]
-        axes[0].set_ylim(min([*errors, 1e-3]) / 3, min(max([*errors, 1e-3]) * 3, 1e2))
-        axes[0].set_ylabel("global error [rad, m]; grey: the reference's own")
-        figure.suptitle(self.name)
-        figure.legend(loc="outside right upper", fontsize=7)
-        return figure
+        return draw(self.name, by_method(self.rows), [y.uncertainty for y in self.yardsticks])
 
     def write(self, folder: str | Path) -> Path:
         """Write table.csv, report.json, report.txt and report.png into `folder`, made when missing."""
@@ -171,7 +140,7 @@ class Report:
         finite = [{k: _json(v) for k, v in row.items()} for row in self.table()]
         content = {
             "name": self.name,
-            "references": [asdict(yardstick) for yardstick in self.yardsticks],
+            "references": [{k: _json(v) for k, v in asdict(y).items()} for y in self.yardsticks],
             "notes": list(self.notes),
             "recommendation": self.recommendation().splitlines(),
             "rows": finite,
@@ -198,12 +167,16 @@ class Report:
         lines += [f"Note: {note}." for note in self.notes]
         if len(rows) < len(self.rows):
             lines.append(f"Of {len(self.rows)} runs those that no other beats in both error and time:")
-        lines += ["", f"{'engine':8}{'method':14}{'setting':>20}{'error':>10}{'cpu':>10}{'evaluations':>13}"]
+        if rows:
+            heads = f"{'error':>10}{'estimate':>10}{'cpu':>10}{'evaluations':>13}"
+            lines += ["", f"{'engine':8}{'method':14}{'setting':>20}{heads}"]
         for row in rows:
             knob = f"{row.knob} {row.setting:.3g}" + (" s" if row.knob == "step" else "")
             error = f"{row.error:.1e}" if math.isfinite(row.error) else "diverged"
+            estimate = f"{row.estimate:.1e}" if math.isfinite(row.estimate) else "-"
             lines.append(
-                f"{row.engine:8}{row.method:14}{knob:>20}{error:>10}{_seconds(row.cpu_s):>10}{row.evaluations:>13}"
+                f"{row.engine:8}{row.method:14}{knob:>20}{error:>10}{estimate:>10}{_seconds(row.cpu_s):>10}"
+                f"{row.evaluations:>13}"
             )
         return "\n".join([*lines, "", self.recommendation(), ""])
 
@@ -229,17 +202,21 @@ def report(
 
     Raises:
         EngineError: an unknown engine, or a reference that did not reach its end.
+        RecordingError: `out_dir` cannot be written to; told before any work.
         SceneError: a scene with mistakes.
     """
+    if out_dir is not None:
+        check_writable(Path(out_dir))
     if isinstance(subject, HardCase | Case | mujoco.MjModel):
         result = _of_case(subject, engines, budget_s, progress)
     else:
         plan = _plan(subject)
-        result = (
-            _of_case(scene_case(plan), engines, budget_s, progress)
-            if is_free(plan)
-            else _of_scene(plan, budget_s, progress)
-        )
+        if plan.engine.what == "kinematic":
+            result = Report(scene_case(plan).name, (), (), (_KEYED,))
+        elif is_free(plan):
+            result = _of_case(scene_case(plan), engines, budget_s, progress)
+        else:
+            result = _of_scene(plan, budget_s, progress)
     if out_dir is not None:
         result.write(out_dir)
     return result
@@ -283,18 +260,19 @@ def _of_case(
     notes = (f"no smooth engine: {why}",) if smooth is None else smooth.differences
     if hard is not None:
         error: Error = partial(hard.error, model=case.model)
+        apart: Apart = partial(hard.apart, model=case.model)
         yardstick = Yardstick(hard.source, 1e-15)
     else:
         if smooth is not None:
             reference = smooth_reference(case, smooth)
         else:
             reference = mujoco_reference(case, case.duration / case.frames / 2**10)
-        error = _against(case, reference)
-        yardstick = Yardstick(reference.source, reference.uncertainty)
+        error, apart = _against(case, reference), partial(trajectory_error, case)
+        yardstick = _yardstick(reference)
     rows: list[Row] = []
     for runner in runners(case, smooth, engines):
         _tell(progress, runner)
-        rows += sweep(runner, error, floor=yardstick.uncertainty, budget_s=budget_s)
+        rows += sweep(runner, error, apart, floor=yardstick.uncertainty, budget_s=budget_s)
     return Report(case.name, tuple(rows), (yardstick,), notes)
 
 
@@ -313,17 +291,20 @@ def _of_scene(plan: Plan, budget_s: float, progress: Callable[[str], None] | Non
     engines = list(dict.fromkeys(runner.engine for runner in found))
     references = scene_references(engines, plan, case, budget_s=4 * budget_s)
     if len(references) == 2:
-        apart = trajectory_error(case, references["smooth"].motion, references["contact"].motion)
-        notes.append(
-            f"the physics of the two engines lie {apart:.2g} rad or m apart, beside the errors below"
-        )
+        gap = trajectory_error(case, references["smooth"].motion, references["contact"].motion)
+        notes.append(f"the physics of the two engines lie {gap:.2g} rad or m apart, beside the errors below")
     rows: list[Row] = []
     for runner in found:
         _tell(progress, runner)
         reference = references[runner.engine]
-        rows += sweep(runner, _against(case, reference), floor=reference.uncertainty, budget_s=budget_s)
-    sticks = tuple(Yardstick(r.source, r.uncertainty, engine) for engine, r in references.items())
+        error, apart = _against(case, reference), partial(trajectory_error, case)
+        rows += sweep(runner, error, apart, floor=reference.uncertainty, budget_s=budget_s)
+    sticks = tuple(_yardstick(r, engine) for engine, r in references.items())
     return Report(case.name, tuple(rows), sticks, tuple(notes))
+
+
+def _yardstick(reference: Reference, engine: str = "") -> Yardstick:
+    return Yardstick(reference.source, reference.uncertainty, engine, reference.sure_until)
 
 
 def _against(case: Case, reference: Reference) -> Error:
@@ -335,19 +316,10 @@ def _tell(progress: Callable[[str], None] | None, runner: Runner) -> None:
         progress(f"{runner.engine} {runner.method} by {runner.knob}")
 
 
-def _by_method(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
-    found: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        found.setdefault((row.engine, row.method, row.knob), []).append(row)
-    return found
-
-
 def _stiffness(rows: Sequence[Row]) -> list[str]:
     """A sentence when a loose tolerance costs an explicit method as much as a tight one."""
-    by_method = _by_method(rows)
-    loose = [
-        row for row in by_method.get(("smooth", "dopri5", "tolerance"), []) if row.setting in (1e-3, 1e-6)
-    ]
+    methods = by_method(rows)
+    loose = [row for row in methods.get(("smooth", "dopri5", "tolerance"), []) if row.setting in (1e-3, 1e-6)]
     if len(loose) == 2 and loose[1].evaluations < 1.3 * loose[0].evaluations:
         return ["Stiff: DOPRI5 takes as many steps at 1e-3 as at 1e-6, its stability sets them."]
     return []

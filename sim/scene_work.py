@@ -21,7 +21,7 @@ from .errors import EngineError
 from .integrate import TABLEAUS
 from .integrate.problems import constraints_of
 from .plan import Plan
-from .work_precision import TOLERANCES, Case, Motion, Reference, trajectory_error
+from .work_precision import TOLERANCES, Case, Motion, Reference, sure_until, trajectory_error
 
 FRAMES = 50
 TIGHT = 1e-12
@@ -39,6 +39,16 @@ class SceneWork:
     engine: str
     method: str
     knob: str = "step"
+
+    @property
+    def order(self) -> int:
+        """Power of the setting that errors go with."""
+        if self.knob == "tolerance":
+            return 1
+        if self.engine == "smooth":
+            return TABLEAUS[self.method].order
+        # at contacts and limits no method keeps its order
+        return 4 if self.method == "rk4" and not constraints_of(self.case.model) else 1
 
     def settings(self) -> Iterable[float]:
         """The controller's period, or a frame's time, and its halves; or tolerances."""
@@ -119,7 +129,8 @@ def scene_references(
     engines: Iterable[str], plan: Plan, case: Case, *, budget_s: float
 ) -> dict[str, Reference]:
     """The reference of each engine: two methods at a tight tolerance, where it has any; or steps that halve
-    until two runs agree to 1e-10, or one costs `budget_s`.
+    until two runs agree to 1e-10, or one costs `budget_s`. Where contacts and limits make the last halving
+    hardly better than the one before, the larger difference is the uncertainty.
 
     Raises:
         EngineError: a reference did not reach the end.
@@ -131,12 +142,13 @@ def scene_references(
             continue
         runner = SceneWork(plan, case, engine, FINEST[engine])
         settings = list(runner.settings())
-        before, uncertainty, step = runner.run(settings[1]), float("nan"), settings[1]
+        motions, uncertainty, step = [runner.run(settings[1])], float("nan"), settings[1]
+        gaps: list[float] = []
         for step in settings[2:]:
             began = time.process_time()
-            motion = runner.run(step)
-            uncertainty = trajectory_error(case, before, motion)
-            before = motion
+            motions.append(runner.run(step))
+            gaps.append(trajectory_error(case, *motions[-2:]))
+            uncertainty = gaps[-1] if len(gaps) < 2 or gaps[-1] < 0.3 * gaps[-2] else max(gaps[-2:])
             if uncertainty < 1e-10 or time.process_time() - began > budget_s:
                 break
         if not np.isfinite(uncertainty):
@@ -144,7 +156,8 @@ def scene_references(
                 f"{case.name}: the {engine} engine's reference did not reach {case.duration:g} s"
             )
         source = f"{engine} engine, {runner.method} at {step:.3g} s; uncertainty by twice that step"
-        references[engine] = Reference(before, uncertainty, source)
+        sure = sure_until(case, *motions[-2:])
+        references[engine] = Reference(motions[-1], uncertainty, source, sure)
     return references
 
 
@@ -155,4 +168,5 @@ def _by_tolerance(plan: Plan, case: Case) -> Reference | None:
     uncertainty = trajectory_error(case, *motions)
     if not np.isfinite(uncertainty):
         return None
-    return Reference(motions[0], uncertainty, f"smooth engine, verner98 to {TIGHT:g}; uncertainty by dop853")
+    source = f"smooth engine, verner98 to {TIGHT:g}; uncertainty by dop853"
+    return Reference(motions[0], uncertainty, source, sure_until(case, *motions))

@@ -6,7 +6,7 @@ from oracles import pendulum, small_motion
 from oracles.rigid_body import FreeBody, Top
 from pantograph.sim.dynamics.smooth import compile_model
 from pantograph.sim.hard_cases import HARD_CASES
-from pantograph.sim.work_precision import smooth_reference
+from pantograph.sim.work_runners import smooth_reference
 from scipy.integrate import solve_ivp
 
 CASES = {case.name: case for case in HARD_CASES}

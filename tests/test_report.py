@@ -2,25 +2,23 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 from oracles import pendulum
-from pantograph.sim.errors import EngineError
+from oracles.mujoco_motion import motion
+from pantograph.models import load_model
+from pantograph.sim import Scene, run
+from pantograph.sim.errors import EngineError, RecordingError
 from pantograph.sim.hard_cases import HARD_CASES
 from pantograph.sim.plan import make_plan
 from pantograph.sim.report import Report, Yardstick, report
 from pantograph.sim.scene.load import load_scene
 from pantograph.sim.scene_work import scene_case, scene_references, scene_runners
-from pantograph.sim.work_precision import (
-    Case,
-    Row,
-    runners,
-    smooth_or_none,
-    smooth_reference,
-    trajectory_error,
-)
+from pantograph.sim.work_precision import Case, Row, trajectory_error
+from pantograph.sim.work_runners import runners, smooth_or_none, smooth_reference
 
 PENDULUM = """<mujoco><worldbody><body><joint axis="0 -1 0"/>
 <inertial pos="0 0 -1" mass="1" diaginertia="1e-14 1e-14 1e-14"/></body></worldbody></mujoco>"""
@@ -188,6 +186,59 @@ law = "pd"
 period = 0.01
 frequency = 4
 """
+
+
+def test_estimates_need_no_reference_and_come_near_the_error(swing_report):
+    result, _ = swing_report
+    usable = [r for r in result.rows if r.engine in ("smooth", "mujoco") and 1e-8 < r.error < 1e-3]
+    assert {r.knob for r in usable} == {"step", "tolerance"} and len(usable) > 40
+    for r in usable:
+        assert r.error / 3 < r.estimate < 3 * r.error, r
+
+
+def test_what_is_recommended_does_what_it_says(tmp_path):
+    """Run as a scene, against SciPy on MuJoCo's accelerations."""
+    (tmp_path / "free.toml").write_text(SCENE)
+    best = report(tmp_path / "free.toml", engines=("smooth",), budget_s=0.02)
+    scene = load_scene(tmp_path / "free.toml").model_dump(exclude_unset=True)
+    for target in (1e-3, 1e-6, 1e-9):
+        row = best.cheapest(target)
+        knob = {"step" if row.knob == "step" else "tolerance": row.setting, "integrator": row.method}
+        # frames at whole steps, so that nothing but the recommended setting is at work
+        words = {"rate": 1 / row.setting} if row.knob == "step" else {}
+        recording = run(Scene(**{**scene, **words, "solver": {"engine": "smooth", **knob}}))
+        truth = motion(recording.model, recording.q[0], recording.v[0], recording.t, rtol=1e-12)
+        assert np.abs(recording.q - truth).max() < 1.05 * target + 1e-10
+
+
+def test_a_scene_of_keys_alone_has_nothing_to_compare(tmp_path):
+    keys = '[[keys]]\njoint = "{}"\ntimes = [0, 0.4]\nvalues = [60, 20]\n'
+    (tmp_path / "keyed.toml").write_text(SCENE.replace("[initial.position]\nshoulder = 60\n", "")
+                                         + keys.format("shoulder") + keys.format("elbow"))  # fmt: skip
+    result = report(tmp_path / "keyed.toml", tmp_path / "out")
+    assert not result.rows and "every joint is keyed" in result.brief()
+    assert "nothing is integrated" in (tmp_path / "out" / "report.txt").read_text()
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["rows"] == []
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordingError, match="cannot write into"):
+        report(swing(), tmp_path / "file" / "out", progress=lambda _: pytest.fail("worked in vain"))
+
+
+def test_chaos_beyond_its_horizon_is_told():
+    """Two references of a wild double pendulum part for good; no target is promised."""
+    model = load_model("double_pendulum")
+    case = Case("wild", model, np.array([3.0, 0.5]), np.array([0.0, 4.0]), 60.0)
+    reference = smooth_reference(case, smooth_or_none(model)[0])
+    assert reference.uncertainty > 1e-3 and 5 < reference.sure_until < 60
+    early = replace(case, duration=0.8 * reference.sure_until)
+    assert smooth_reference(early, smooth_or_none(model)[0]).sure_until == np.inf
+    stick = Yardstick("x", reference.uncertainty, "", reference.sure_until)
+    words = Report("wild", (row("smooth", 1e-4, 1.0),), (stick,)).recommendation()
+    assert f"Beyond {reference.sure_until:.3g} s the reference is not sure" in words
+    assert words.count("not that sure") == 3
 
 
 def test_a_free_scene_is_a_case(tmp_path):
