@@ -1,4 +1,4 @@
-"""Plots of a recording against time: joint positions with their keys, velocities, forces, energies."""
+"""Plots of a recording against time: joint positions with their keys, velocities, forces, energies, goals."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST = 10  # joints drawn when none are named
+_LEAST = 1e-9  # [m or rad] off a goal that is drawn
 
 
 def plot(recording: Recording, path: str | Path, *, joints: Sequence[str] = ()) -> Path:
@@ -46,8 +47,9 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
         raise PantographError("the recording has fewer than two samples; there is nothing to plot")
     m, t = recording.model, recording.t
     scalars, left = _chosen(recording, joints)
-    chart = Figure(figsize=(10, 11), layout="constrained")
-    axes = chart.subplots(4, 1, sharex=True)
+    panels = 4 + bool(recording.goals)
+    chart = Figure(figsize=(10, 2.75 * panels), layout="constrained")
+    axes = chart.subplots(panels, 1, sharex=True)
     keys = _keys(recording)
     for colour, j in zip(_colours(len(scalars)), scalars, strict=True):
         iq, iv, name = m.jnt_qposadr[j], m.jnt_dofadr[j], name_of(m, "joint", j)
@@ -61,6 +63,8 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
     axes[3].plot(t, recording.kinetic, label="kinetic", color="tab:orange")
     axes[3].plot(t, recording.potential, label="potential", color="tab:blue")
     axes[3].plot(t, recording.energy, label="total", color="black", lw=2)
+    if recording.goals:
+        _missed(recording, axes[4])
     _units(m, scalars, axes)
     title = recording.scene.get("title") or "recording"
     more = f" ({left} joints that move less are not drawn)" if left else ""
@@ -77,6 +81,18 @@ def figure(recording: Recording, *, joints: Sequence[str] = ()) -> Figure:
         ax.grid(alpha=0.3)
         ax.margins(x=0)
     return chart
+
+
+def _missed(recording: Recording, ax: Any) -> None:
+    """How far the motion is from the goals of its scene."""
+    for k, (name, colour) in enumerate(zip(recording.goals, _colours(len(recording.goals)), strict=True)):
+        for rows, unit, style in zip(recording.missed[:, k].T, ("m", "rad"), ("-", "--"), strict=True):
+            if rows.any():
+                ax.plot(recording.t, np.maximum(rows, _LEAST), style, color=colour, label=f"{name} [{unit}]")
+    ax.set_yscale("log")
+    ax.set_ylabel("off the goals [m or rad]")
+    if ax.lines:
+        ax.legend(fontsize=8, loc="best")
 
 
 def _apart(events: Sequence[Event], gap: float) -> list[Event]:
@@ -133,7 +149,7 @@ def _units(m: mujoco.MjModel, scalars: list[int], axes: Any) -> None:
     for ax, what, unit in zip(axes, ("position", "velocity", "drive force"), units, strict=False):
         ax.set_ylabel(f"{what} [{unit}]")
     axes[3].set_ylabel("energy [J]")
-    axes[3].set_xlabel("time [s]")
+    axes[-1].set_xlabel("time [s]")
 
 
 def _colours(n: int) -> list[Any]:

@@ -70,6 +70,27 @@ def test_a_locked_foot_stands_still_at_every_time(seed, rate):
     assert np.abs(fine.v).max() < 8 and np.abs(fine.a).max() < 250  # of the walk as given: 4.2 and 19
 
 
+@settings(max_examples=4, deadline=None)
+@given(seeds, st.sampled_from([15, 30, 60]), st.floats(0.1, 0.5))
+def test_what_slides_is_told_whatever_the_motion(seed, rate, drift):
+    """Legs that are stretched out, or too short for a pelvis that walks on while they stand."""
+    rng = np.random.default_rng(seed)
+    model, times = load_model("puppet"), np.arange(0, 1.2, 1 / rate)
+    q = walk(model, times)
+    q[:, 0] += drift * times
+    start = float(rng.uniform(0.15, 0.3))
+    stances = {"left_foot": [(start, start + float(rng.uniform(0.2, 0.7)))]}
+    locked = lock(model, times, q, stances)
+    seen, far = _drift(model, locked, "left_foot", *stances["left_foot"][0])
+    told = np.any([(seen >= s.start - 3e-3) & (seen <= s.end + 3e-3) for s in locked.slides], axis=0)
+    assert (far[~np.broadcast_to(told, far.shape)] <= 1e-4 + 1e-6).all()
+    assert all(
+        s.far == pytest.approx(np.interp(s.worst, seen, far), rel=0.02, abs=1e-5) for s in locked.slides
+    )
+    assert locked.met.all() == (not locked.slides)
+    assert all(ik_cases.illegal(model, x) == [] for x in locked.q)
+
+
 @needs_captures
 def test_captured_feet_stand_still():
     model, t, q, stances = captures.capture("fb")

@@ -37,7 +37,7 @@ _EASED = 1e4  # weight of places on the way to a stance, beside one of the motio
 _TURNED = 1e2  # of orientations in stances
 _STEPS = 8  # that bring frames to their places
 _BETWEEN = 8  # times between two instants at which the curve is looked at
-_FINEST = 1e-3  # [s]
+_FINEST = 1 / 400  # [s]
 _BESIDE, _KINK = 4, 0.035  # instants, [s]: how far a spline's kink where a leg gets too short may reach
 
 
@@ -218,7 +218,7 @@ class _Drift(NamedTuple):
     def coarse(self, t: Array, tolerance: float) -> bool:
         """Whether finer instants than t (n,) serve: it slips between some that are far from those where the
         place is out of reach."""
-        at = np.isin(self.times, t)
+        at = np.abs(self.times - t[np.clip(np.searchsorted(t, self.times - 1e-9), 0, len(t) - 1)]) < 1e-8
         lost = self.times[at & (self.far > 10 * _LOCKED)]
         slips = self.times[self.far > tolerance]
         apart = np.abs(slips[:, None] - lost).min(axis=1, initial=np.inf)
@@ -276,9 +276,7 @@ class _Line:
         )
         out = self.space.clip(q)
         for k, ws in enumerate(wanted):
-            if ws:
-                out[k] = smooth[k]
-            held = [Position(w.frame, w.p, tolerance=_LOCKED) for w in ws if w.locked]
+            held = [Position(w.frame, w.p, tolerance=_LOCKED) for w in ws]
             if held:
                 problem = Problem(
                     self.model, held, self.space, joints=self.joints, kinematics=self.kinematics
