@@ -6,12 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.controllers.fit import Phase, check, machine, retime
-from pantograph.controllers.fit.check import forces
+from pantograph.controllers.fit.check import follow, forces
 from pantograph.models import load_model
 from pantograph.sim import PantographError
 from pantograph.sim.clip import Clip, Motion
-from pantograph.sim.curves import keyed
-from scipy.optimize import linprog
+from pantograph.sim.curves import PolynomialCurve, keyed
+from scipy.interpolate import PPoly
+from scipy.optimize import brentq, linprog
 from strategies import seeds
 
 NAMES = ("shoulder", "elbow")
@@ -173,6 +174,127 @@ def test_jerk_holds_with_all_other_limits(seed, kind):
     off = max(np.abs(way - row).max(axis=1).min() for row in q[::100])
     assert off < 2e-4
     np.testing.assert_allclose(found.clip.evaluate(found.duration).q, clip.evaluate(2.0).q, atol=1e-9)
+
+
+def test_curvature_that_jumps_is_a_stop_and_only_there():
+    """Between the keys of an auto curve from stop to stop; a natural one has none, and is the faster."""
+    times, keys = [0, 1, 2, 3], np.array([[0.0, 0.5, 0.9, 1.0], [0.0, 0.1, 0.5, 0.6]])
+    able = machine(ARM, velocity=3.0, acceleration=20.0, jerk=300.0, force=np.inf)
+    found = {}
+    for kind in ("auto", "natural"):
+        tracks = {n: keyed(times, row, kind=kind) for n, row in zip(NAMES, keys, strict=True)}
+        found[kind] = retime(Clip(ARM, tracks, ARM.qpos0), able, points=1200)
+        assert found[kind].report.possible
+        assert found[kind].slowed < 1.01
+    auto = found["auto"]
+    assert [s.s for s in auto.stops] == [1.0, 2.0]
+    assert all(s.why == "the curvature of shoulder, elbow jumps" for s in auto.stops)
+    at = auto.clip.evaluate([s.t for s in auto.stops])
+    assert np.abs(at.v).max() <= 1e-9
+    assert np.abs(at.a).max() <= 1e-6
+    assert found["natural"].stops == ()
+    assert found["natural"].duration < auto.duration
+    parts = []  # each piece by itself, from rest to rest, takes as long
+    for k in range(3):
+        cut = [keyed_piece(c, times[k], times[k + 1]) for c in auto_curves(times, keys)]
+        clip = Clip(ARM, dict(zip(NAMES, cut, strict=True)), ARM.qpos0)
+        parts.append(retime(clip, able, points=400).duration)
+    assert auto.duration == pytest.approx(sum(parts), rel=5e-3)
+
+
+def auto_curves(times, keys):
+    return [keyed(times, row, kind="auto") for row in keys]
+
+
+def keyed_piece(curve, start, stop):
+    """A cubic piece of a curve as a curve of its own."""
+    inside = np.linspace(start, stop, 4)
+    powers = np.linalg.solve(np.vander(inside - start, 4), curve(inside).q)
+    t = np.array([0.0, stop - start])
+    ends = curve([start]).q, curve([stop], left=True).q
+    return PolynomialCurve(t, np.concatenate(ends), t, "hold", "hold", powers[:, None, :])
+
+
+@given(st.floats(0.2, 2.0), st.floats(20.0, 300.0))
+@settings(max_examples=5)
+def test_the_way_back_is_no_stop(d, jerk):
+    """There and back with jerk alone bounded: + - on the way and, mirrored, - + back; no rest at the turn."""
+    clip = Clip(ARM, {"shoulder": keyed([0, 1, 2], [0, d, 0], kind="clamped")}, ARM.qpos0)
+    found = retime(clip, machine(ARM, jerk=jerk, force=np.inf), points=400)
+    assert found.stops == ()
+    assert found.duration == pytest.approx(2 * np.cbrt(d / jerk / half_way_back()), rel=5e-3)
+    turn = np.interp(1.0, found.s, found.t)
+    assert abs(found.clip.evaluate(turn).v[0]) <= 1e-9
+    assert abs(found.clip.evaluate(turn).a[0]) > 0.3 * np.cbrt(d * jerk**2)
+
+
+def half_way_back():
+    """Distance in one second from rest to a speed of zero with jerk + 1, then - 1: v(1) = 0."""
+    t = brentq(lambda x: 0.5 * x**2 + x * (1 - x) - 0.5 * (1 - x) ** 2, 0.1, 0.9)
+    w = 1 - t
+    return t**3 / 6 + 0.5 * t**2 * w + 0.5 * t * w**2 - w**3 / 6
+
+
+@pytest.mark.parametrize("kind", ["linear", "auto", "natural", "clamped", "smooth"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_bounded_jerk_costs_little_for_any_kind_of_keys(seed, kind):
+    """No faster than without, and slower by no more than a few changes of the acceleration a key."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.2, 1.0, 5))
+    ease = {"ease": "smooth"} if kind == "smooth" else {"kind": kind}
+    tracks = {n: keyed(t, rng.uniform(-1, 1, 5), **ease) for n in NAMES[: 1 + seed % 2]}
+    clip = Clip(ARM, tracks, ARM.qpos0)
+    limits = {"velocity": 2.0, "acceleration": 8.0, "force": np.inf}
+    found = retime(clip, machine(ARM, **limits, jerk=80.0), points=400)
+    least = retime(clip, machine(ARM, **limits), points=400).duration
+    assert found.report.possible
+    assert found.slowed < 1.03
+    assert least <= found.duration <= least + 3 * len(t) * 2 * 8.0 / 80.0
+
+
+def test_a_hairpin_is_no_stop():
+    """Two joints that turn within a millisecond of each other."""
+    t = [0.0, 1.0, 2.0]
+    tracks = {
+        "shoulder": keyed(t, [0.0, 0.8, 0.1], kind="natural"),
+        "elbow": keyed(t, [0.0, 0.5, 0.06], kind="natural"),
+    }
+    clip = Clip(ARM, tracks, ARM.qpos0)
+    able = machine(ARM, velocity=3.0, acceleration=20.0, jerk=200.0, force=np.inf)
+    found = retime(clip, able, points=400)
+    assert found.report.possible
+    assert found.slowed < 1.03
+    straight = retime(Clip(ARM, {"shoulder": tracks["shoulder"]}, ARM.qpos0), able, points=400)
+    assert found.duration == pytest.approx(straight.duration, rel=0.1)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_jerk_of_a_trace_is_that_of_the_polynomials(seed):
+    """Quintics: by SciPy's third derivative, and infinite where accelerations jump."""
+    rng = np.random.default_rng(seed)
+    t, c = np.array([0.0, 0.7, 1.0]), rng.normal(size=(6, 2, 1))
+    c[-1, 1] = sum(c[k, 0] * 0.7 ** (5 - k) for k in range(6))
+    curve = PolynomialCurve(t, np.zeros((3, 1)), t, "hold", "hold", c)
+    clip = Clip(ARM, {"elbow": curve}, ARM.qpos0)
+    trace = follow(clip, t)
+    exact = np.abs(PPoly(c, t).derivative(3)(trace.t[:, None])[..., 0, 0])
+    inner = np.ones(22, dtype=bool)
+    inner[[10, 11]] = False  # the right side of the break is what SciPy gives
+    np.testing.assert_allclose(trace.jerk[inner, 1], exact[inner], rtol=1e-9, atol=1e-9)
+    assert np.isinf(trace.jerk[[10, 11], 1]).all()
+
+
+@given(seeds)
+@settings(max_examples=8)
+def test_velocity_alone_holds_where_keys_rest(seed):
+    """Where keys rest any rate will do at a point, but not beside it."""
+    clip = arm_clip(seed, kind="auto", keys=5)
+    found = retime(clip, machine(ARM, velocity=1.5, force=np.inf), points=300)
+    assert found.report.possible
+    assert found.slowed < 1.02
+    way = np.abs(np.diff(clip.evaluate(np.linspace(0, 2, 4001)).q, axis=0)).max(axis=1).sum()
+    assert way / 1.5 <= found.duration * (1 + 1e-6) <= 1.05 * way / 1.5
 
 
 def test_a_missing_drive_is_a_violation():

@@ -25,13 +25,14 @@ Rows = Callable[[Motion], tuple[Array, Array, Array, Array]]
 
 
 class Timed(NamedTuple):
-    """Times t (n + 1,) from zero along a path, and r, u at its nodes; ``u`` is that after the node where the
-    path turns back."""
+    """Times t (n + 1,) from zero along a path, r at its nodes, u (n,) at the beginning and the end of each
+    piece."""
 
     along: Path
     t: Array
     r: Array
-    u: Array
+    begin: Array
+    end: Array
 
 
 def fastest(
@@ -95,9 +96,8 @@ def fastest(
         )
     out = np.asarray(best["x"]).ravel() * unit
     u = out[3 * n + 1 :]
-    return Timed(
-        along, np.append(0.0, np.cumsum(out[:n])), out[2 * n : 3 * n + 1], np.where(along.back, -u, u)
-    )
+    t, first = np.append(0.0, np.cumsum(out[:n])), np.where(along.back, -u, u)[:-1]
+    return Timed(along, t, out[2 * n : 3 * n + 1], first, u[1:])
 
 
 def _conditions(
@@ -159,12 +159,11 @@ def _bounds(along: Path, speed: Array, ends: tuple[float, float]) -> tuple[Array
 def motion(clip: Clip, now: Timed, jerky: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
     """q (n + 1, nq) and v (n + 1, nv) at the nodes, accelerations (n, nv) at the beginning and the end of
     each piece; those of the freedoms ``jerky`` (nv,) do not jump."""
-    along, r, u = now.along, now.r[:, None], now.u[:, None]
+    along, r = now.along, now.r[:, None]
     q = np.vstack([clip.evaluate(along.s[:-1]).q, clip.evaluate(along.s[-1:], left=True).q])
     v = np.vstack([along.begin.v, along.end.v[-1:]]) * r
-    before = np.where(along.back, -now.u, now.u)[1:, None]
-    a0 = along.begin.v * u[:-1] + np.where(r[:-1] > 0, along.begin.a, 0.0) * r[:-1] ** 2
-    a1 = along.end.v * before + np.where(r[1:] > 0, along.end.a, 0.0) * r[1:] ** 2
+    a0 = along.begin.v * now.begin[:, None] + np.where(r[:-1] > 0, along.begin.a, 0.0) * r[:-1] ** 2
+    a1 = along.end.v * now.end[:, None] + np.where(r[1:] > 0, along.end.a, 0.0) * r[1:] ** 2
     a1[:-1, jerky] = a0[1:, jerky]
     return q, v, a0, a1
 
@@ -175,19 +174,17 @@ def _between(along: Path, known: Timed) -> list[Array]:
     p = p * old[-1] / p[-1]
     t, fine = _times(known, old, p)
     dt = np.maximum(np.diff(t), 1e-12 * t[-1])
-    before = np.where(known.along.back, -known.u, known.u)
-    r, u = (np.interp(t, known.t, x) for x in (known.r, before))
+    r, u = (np.interp(t, known.t, x) for x in (known.r, np.append(known.begin[0], known.end)))
     return [dt, np.interp(0.5 * (t[1:] + t[:-1]), 0.5 * (known.t[1:] + known.t[:-1]), fine), r, u]
 
 
 def _times(known: Timed, old: Array, p: Array) -> tuple[Array, Array]:
     """Times (m,) at lengths p (m,) of the path of what is known over lengths ``old`` (n,); its j (n - 1,)."""
-    before = np.where(known.along.back, -known.u, known.u)
     dt = np.diff(known.t)
-    j = (before[1:] - known.u[:-1]) / np.maximum(dt, 1e-300)
+    j = (known.end - known.begin) / np.maximum(dt, 1e-300)
     part = np.linspace(0.0, 1.0, 21)
     s = dt[:, None] * part
-    gone = old[:-1, None] + s * (known.r[:-1, None] + s * (known.u[:-1, None] / 2.0 + s * j[:, None] / 6.0))
+    gone = old[:-1, None] + s * (known.r[:-1, None] + s * (known.begin[:, None] / 2.0 + s * j[:, None] / 6.0))
     return np.interp(p, np.maximum.accumulate(gone.ravel()), (known.t[:-1, None] + s).ravel()), j
 
 

@@ -18,7 +18,7 @@ from ...sim.clip import Clip, Motion
 from ...sim.errors import PantographError
 from .check import forces
 from .machine import Machine
-from .path import Corner, corner
+from .path import TURN, Corner, Path, corner
 
 Array = NDArray[np.float64]
 _FLOOR = 1e-9  # x below this part of its bound counts as standing still when sqrt(x) is bounded
@@ -32,15 +32,20 @@ def even(clip: Clip, points: int) -> Array:
 
 
 class Grid:
-    """The path on a grid, with rows a u + b x + e sqrt(x) <= c of the limits at both ends of each piece."""
+    """The path on a grid, with rows a u + b x + e sqrt(x) <= c of the limits at both ends of each piece.
 
-    def __init__(self, clip: Clip, machine: Machine, s: Array) -> None:
+    It is taken by the time of the keys at times s (n + 1,), or by the length of the path ``along`` them.
+    """
+
+    def __init__(self, clip: Clip, machine: Machine, s: Array, along: Path | None = None) -> None:
         self.clip, self.machine, self.s = clip, machine, s
-        self.h = np.diff(self.s)
-        begin, end = clip.evaluate(self.s[:-1]), clip.evaluate(self.s[1:], left=True)
+        self.h, self.pace = np.diff(s), np.ones(len(s))
+        begin, end = clip.evaluate(s[:-1]), clip.evaluate(s[1:], left=True)
         gap = np.abs(begin.q[1:] - end.q[:-1]).max(axis=1, initial=0.0) > 1e-9
         if gap.any():
             raise PantographError(f"no timing helps: the path jumps at {self.s[1:-1][gap][0]:.4g} s")
+        if along is not None:
+            begin, end, self.h, self.pace = along.begin, along.end, along.length, along.rate**2
         rows0, rows1 = self.rows(begin), self.rows(end)
         # at the end of a piece x has become x + 2 h u
         a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
@@ -62,7 +67,7 @@ class Grid:
         self.cap = np.where(resting, np.minimum(self.cap, 1.0), np.minimum(self.cap, 1e8))
         # where the path has a corner, nothing but a stop goes round it
         self.turn = np.abs(begin.v[1:] - end.v[:-1])
-        self.cornered = self.turn.max(axis=1, initial=0.0) > 1e-6 * top
+        self.cornered = self.turn.max(axis=1, initial=0.0) > (1e-6 * top if along is None else TURN)
         self.cap[1:-1][self.cornered] = 0.0
         self.moving = (
             bool(np.any(np.abs(begin.v[0]) > 1e-9 * top)),
@@ -84,6 +89,11 @@ class Grid:
                 old = getattr(self, name)
                 setattr(self, name, np.insert(old, [k], more, axis=1))
             self.half += k == 0
+
+    def pauses(self) -> list[tuple[float, float]]:
+        """Times between which nothing moves."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], self.still.astype(int), [0]])))
+        return [(float(self.s[a]), float(self.s[b])) for a, b in edges.reshape(-1, 2)]
 
     def corners(self) -> list[Corner]:
         """Where the path has a corner and does not rest as it is."""
@@ -153,7 +163,7 @@ class Grid:
                 w[used] = signs * machine.ampere[used]
                 add(push @ w, square @ w, machine.current - weight @ w, np.maximum(drag @ w, 0.0))
 
-    def fastest(self, keep: bool, at_rest: bool) -> Array:
+    def fastest(self, keep: bool, at_rest: tuple[bool, bool]) -> Array:
         """The largest possible x (n + 1,) at the grid's times, with tangents of the last solution's roots."""
         x = self.solve(keep, at_rest)
         for _ in range(6 if self.curved else 0):
@@ -164,9 +174,9 @@ class Grid:
                 break
         return x
 
-    def solve(self, keep: bool, at_rest: bool, about: Array | None = None) -> Array:
+    def solve(self, keep: bool, at_rest: tuple[bool, bool], about: Array | None = None) -> Array:
         """The largest possible x (n + 1,) at the grid's times."""
-        cap = np.minimum(self.cap, 1.0) if keep else self.cap.copy()
+        cap = np.minimum(self.cap, self.pace) if keep else self.cap.copy()
         b, c, a = self.b, self.c, self.a
         if self.curved:
             # e sqrt(x) <= e (sqrt(y) + (x - y) / (2 sqrt(y))): y the last solution, or where e alone is all
@@ -178,8 +188,10 @@ class Grid:
             b, c = b + slope, c - 0.5 * self.e * np.sqrt(y)
             a = a.copy()
             a[:, self.half :] += 2.0 * self.h[:, None] * slope[:, self.half :]
-        first = 0.0 if at_rest and self.moving[0] else (cap[0] if at_rest else min(1.0, cap[0]))
-        last = 0.0 if at_rest and self.moving[1] else (cap[-1] if at_rest else min(1.0, cap[-1]))
+        first, last = (
+            (0.0 if moving else cap[k]) if rest else min(self.pace[k], cap[k])
+            for k, rest, moving in zip((0, -1), at_rest, self.moving, strict=True)
+        )
         return _passes(a, b, c, self.h, cap, first, last, self.s)
 
     def _tangents(self, about: Array | None, cap: Array) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from .check import knots
 
 Array = NDArray[np.float64]
 _INSIDE = 1e-5  # of a piece: where the direction of a path that rests at its end is looked at
-_TURN = 1e-3  # change of direction that is a corner
+TURN = 1e-3  # change of direction that is a corner
 _BACK = 1e-5  # and that is none where a path goes back the way it came
 _BEND = 1e-5  # change of curvature that is a jump, relative to the largest beside it
 
@@ -120,7 +120,7 @@ def _judged(clip: Clip, jerky: NDArray[np.bool_], at: Array, ends: Array, keep: 
         least = max(1.0, *(float(np.abs(side.a[i]).max()) for side in far))
         hairpin = max(float(np.abs(side.a[i]).max()) for side in near) > 5.0 * least
         jump = np.abs(bends[1] - bends[0]) > (1e-2 if rests[i] else _BEND) * (1.0 + np.abs(bends).max())
-        turn = np.abs(after - before) > _TURN
+        turn = np.abs(after - before) > TURN
         if np.abs(after + before).max() <= _BACK and not hairpin:
             out.append(Corner(float(s), True, ""))
         elif rests[i] and (broken[i] or eased[i]):
@@ -166,6 +166,26 @@ def _zeros(clip: Clip, low: Array, high: Array) -> Array:
     return high
 
 
+def uneven(clip: Clip, still: list[tuple[float, float]], *, keep: bool) -> bool:
+    """Whether the keys rest or change their speed at once on a way that goes on, or ease into a rest more
+    than a parabola would: the time of the keys is then no measure of the path."""
+    stops = [c.s for c in corners(clip, np.zeros(clip.model.nv, dtype=bool), still, keep=keep)]
+    whole, breaks = clip.evaluate(np.linspace(clip.start, clip.end, 501)), clip.breaks
+    jump = np.abs(clip.evaluate(breaks).v - clip.evaluate(breaks, left=True).v).max(axis=1, initial=0.0)
+    inner = (breaks > clip.start) & (breaks < clip.end) & (jump > _REST * np.abs(whole.v).max())
+    rests = np.union1d(_rests(clip), breaks[inner])
+    for a, b in still:
+        rests = rests[(rests < a) | (rests > b)]
+    if len(rests) and (np.min(np.abs(rests[:, None] - np.append(stops, np.inf)), axis=1) > 0.0).any():
+        return True
+    ends = np.unique([clip.start, clip.end, *stops])
+    for at in (clip.evaluate(ends[:-1]), clip.evaluate(ends[1:], left=True)):
+        slow = np.abs(at.v).max(axis=1) <= _REST * np.abs(whole.v).max()
+        if (slow & (np.abs(at.a).max(axis=1) <= 1e-3 * np.abs(whole.a).max())).any():
+            return True
+    return False
+
+
 def _rests(clip: Clip) -> Array:
     """Times at which everything rests: knots, where that is eased into, and what lies between."""
     span = clip.end - clip.start
@@ -192,14 +212,14 @@ def stretches(
 
 def measure(clip: Clip, start: float, stop: float, found: list[Corner]) -> Measure:
     """The p of a stretch from ``start`` to ``stop`` [s] with the corners ``found``."""
-    s, known = _slowest(clip), np.unique([start, stop, *(c.s for c in found)])
+    s, known = _slowest(clip), np.unique([start, stop, *(c.s for c in found), *_rests(clip)])
     inner = known[(known >= start) & (known <= stop)]
     s = s[(s > start) & (s < stop)]
     room = np.min(np.abs(s[:, None] - inner), axis=1)
     at = clip.evaluate(s)
     v, a = np.linalg.norm(at.v, axis=1), np.linalg.norm(at.a, axis=1)
     width = np.minimum(0.8 * room, 0.2 * (stop - start))
-    sharp = (v <= _SHARP * a * width) & (width > 1e-6 * (stop - start))
+    sharp = (v <= _SHARP * a * width) & (room > 1e-3 * (stop - start))
     return Measure(inner, s[sharp], width[sharp], 0.3 * (a * width)[sharp])
 
 

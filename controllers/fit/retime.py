@@ -16,7 +16,7 @@ from ...sim.errors import PantographError
 from .check import Report, Violation, by_piece, follow, report
 from .grid import Grid, even
 from .machine import Machine
-from .path import Corner
+from .path import Corner, uneven
 from .smooth import smooth
 
 Array = NDArray[np.float64]
@@ -100,8 +100,8 @@ def retime(
         if isinstance(track, FreeTrack):
             raise PantographError(f"joint {name!r} is free: no machine moves it along keys; fit the motion")
     grid = Grid(clip, machine, even(clip, points))
-    x = grid.fastest(keep, at_rest)
-    if np.isfinite(machine.jerk[clip.dofs]).any():
+    x = grid.fastest(keep, (at_rest, at_rest))
+    if np.isfinite(machine.jerk[clip.dofs]).any() or uneven(clip, grid.pauses(), keep=keep):
         at, s, corners = smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points)
         return _slowed(at, s, corners, machine)
     for _ in range(_ROUNDS):
@@ -110,7 +110,7 @@ def retime(
         if not coarse.any() or len(grid.s) > 8 * points:
             break
         grid = Grid(clip, machine, np.union1d(grid.s, 0.5 * (grid.s[1:] + grid.s[:-1])[coarse]))
-        x = grid.fastest(keep, at_rest)
+        x = grid.fastest(keep, (at_rest, at_rest))
     return _slowed(_parabolas(grid, x), grid.s, grid.corners(), machine)
 
 

@@ -1,34 +1,24 @@
-"""Retiming with bounded jerk of a whole clip: stretch by stretch, from stop to stop, pauses kept."""
+"""Retiming of a whole clip by the length of its path: stretch by stretch, from stop to stop, pauses kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip, FreeTrack, Motion
-from ...sim.errors import PantographError
+from ...sim.clip import Clip
 from .bounded import Timed, fastest, motion
 from .charts import Charts
 from .check import by_piece
+from .grid import Grid
 from .machine import Machine
 from .path import Corner, Measure, corners, even_nodes, measure, path, stretches
 
 Array = NDArray[np.float64]
 _ROUNDS, _NEAR = 6, 1.002  # of cutting pieces, until limits hold to this between nodes
 _MOST = 4  # times as many pieces as at first
-
-
-class Grid(Protocol):
-    """What is known of the path: times s (n + 1,), pieces that stand still, and rows of limits."""
-
-    s: Array
-    still: NDArray[np.bool_]
-
-    def rows(self, at: Motion) -> tuple[Array, Array, Array, Array]:
-        """a, b, c, e (n, rows) of a u + b x + e sqrt(x) <= c."""
 
 
 class Smooth(NamedTuple):
@@ -61,16 +51,15 @@ class _Nodes(NamedTuple):
 def smooth(
     clip: Clip, machine: Machine, grid: Grid, x: Array, *, keep: bool, at_rest: bool, points: int
 ) -> Smooth:
-    """The fastest timing with bounded jerk.
+    """The fastest timing, with bounded jerk or without.
 
     ``x`` (n + 1,) is the squared rate of the timing without a limit on jerk. Pieces on which a limit is
-    exceeded are halved. Raises PantographError for free joints, and where no timing is found.
+    exceeded are halved. Raises PantographError where no timing is found.
     """
-    for name, track in clip.tracks.items():
-        if isinstance(track, FreeTrack):
-            raise PantographError(f"joint {name!r} is free: no machine moves it along keys")
-    pauses = _pauses(grid)
+    pauses = grid.pauses()
     found = corners(clip, np.isfinite(machine.jerk) & clip.dofs, pauses, keep=keep)
+    # a program of many variables, or two passes
+    points = points // 8 if np.isfinite(machine.jerk[clip.dofs]).any() else points
     rows = _stretches(clip, found, pauses, x, at_rest, points)
     back = [c.s for c in found if c.back]
     most = _MOST * sum(len(row.nodes) for row in rows)
@@ -84,12 +73,6 @@ def smooth(
             break
         rows = [row if row.by is None else row._replace(nodes=_halved(row.nodes, coarse)) for row in rows]
     return Smooth(at, now.s, found)
-
-
-def _pauses(grid: Grid) -> list[tuple[float, float]]:
-    """Times between which nothing moves."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], grid.still.astype(int), [0]])))
-    return [(float(grid.s[a]), float(grid.s[b])) for a, b in edges.reshape(-1, 2)]
 
 
 def _stretches(
@@ -113,7 +96,7 @@ def _stretches(
             0.0 if at_rest or a > clip.start else first,
             0.0 if at_rest or b < clip.end else last,
         )
-        many = max(24, round(points / 8 * (b - a) / total))
+        many = max(24, round(points * (b - a) / total))
         by = measure(clip, a, b, found)
         rows.append(_Stretch(even_nodes(clip, by, many), speeds, by))
     return rows
@@ -131,7 +114,14 @@ def _timed(
     """The timing of a stretch, from the one ``known`` over fewer nodes; None for a pause."""
     if row.by is None or (known is not None and len(known.along.s) == len(row.nodes)):
         return known
-    return fastest(path(clip, row.by, row.nodes, back), machine, grid.rows, known, ends=row.ends, keep=keep)
+    along = path(clip, row.by, row.nodes, back)
+    if np.isfinite(machine.jerk[clip.dofs]).any():
+        return fastest(along, machine, grid.rows, known, ends=row.ends, keep=keep)
+    mine = Grid(clip, machine, row.nodes, along)
+    x = mine.fastest(keep, (row.ends[0] == 0.0, row.ends[1] == 0.0))
+    r, u = np.sqrt(x), 0.5 * np.diff(x) / mine.h
+    dt = 2.0 * mine.h / np.maximum(r[1:] + r[:-1], 1e-300)
+    return Timed(along, np.append(0.0, np.cumsum(dt)), r, u, u)
 
 
 def _stitched(clip: Clip, machine: Machine, rows: list[_Stretch], known: list[Timed | None]) -> _Nodes:
