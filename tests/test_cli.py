@@ -362,6 +362,28 @@ def test_ctrl_c_keeps_what_was_recorded(folder, engine):
     assert len(r.t) == len(r.q) == len(r.a)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("words", [("schema",), ("models",)])
+def test_a_full_disk_is_told_in_a_line(folder, words):
+    with Path("/dev/full").open("w") as full:
+        process = subprocess.run(
+            [sys.executable, "-m", "pantograph.sim", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert (process.returncode, process.stderr) == (1, "error: No space left on device\n")
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_line(pantograph, folder):
+    (folder / "file").write_text("")
+    for words in (("run", "swing.toml"), ("report", "swing.toml")):
+        code, _, err = pantograph(*words, "--out", "file/there")
+        assert code in (1, 2)
+        assert "Not a directory" in err
+        assert err.count("\n") == 1
+
+
 INTERRUPTING = """\
 import importlib, os, signal, sys
 os.kill(os.getpid(), signal.SIGINT)

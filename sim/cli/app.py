@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +28,20 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
+_SURROUNDINGS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ENAMETOOLONG,
+    errno.EIO,
+)
+"""Numbers of OSErrors that are no mistake of the program."""
+
 console = Console()
 errors = Console(stderr=True)
 
@@ -40,6 +56,14 @@ def run_app() -> None:
     except PantographError as e:
         errors.print(f"[bold red]error:[/] {escape(str(e))}", highlight=False, soft_wrap=True)
         sys.exit(2)
+    except OSError as e:
+        if e.errno not in _SURROUNDINGS:
+            raise
+        where = f"{e.filename}: " if e.filename else ""
+        errors.print(f"[bold red]error:[/] {escape(f'{where}{e.strerror}')}", highlight=False, soft_wrap=True)
+        if not e.filename:  # standard output: what it did not take is not tried again at the end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(1)
     except KeyboardInterrupt as e:
         _tell_interrupt(e)
         sys.exit(130)
