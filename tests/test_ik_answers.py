@@ -154,6 +154,25 @@ def test_a_search_says_that_its_list_may_not_be_complete():
     assert not solve(ik_cases.planar_chain([1.0, 0.8]), band, all=True).complete
 
 
+@pytest.mark.parametrize("seed", [12, 30, 63, 80, 81, 1, 2, 3])
+def test_near_is_the_nearest_of_all_also_where_the_way_from_the_start_leads_elsewhere(seed):
+    """A limited 3R arm to a point, from anywhere; by brute force along the first joint, the rest closed."""
+    rng = np.random.default_rng([seed, 3000])
+    lengths, limit = rng.uniform(0.4, 1, 3), rng.uniform(1.5, 3)
+    model = ik_cases.planar_chain(lengths, [(-limit, limit)] * 3)
+    target = ik_planar.forward(lengths, rng.uniform(-limit, limit, 3))[-1]
+    q0, best = rng.uniform(-limit, limit, 3), np.inf
+    for first in np.linspace(-limit, limit, 2001):
+        c, s = np.cos(first), np.sin(first)
+        rest = [[c, s], [-s, c]] @ (target - lengths[0] * np.array([c, s]))
+        if abs(lengths[1] - lengths[2]) < np.hypot(*rest) < lengths[1] + lengths[2]:
+            for pair in ik_planar.two_links(lengths[1:], rest):
+                if np.abs(pair).max() <= limit:
+                    best = min(best, np.sum((np.array([first, *pair]) - q0) ** 2))
+    solution = solve(model, Position("tip", [*target, 0]), q0=q0)
+    assert np.sum((solution.q - q0) ** 2) <= best + 1e-6
+
+
 # The nearest pose.
 
 

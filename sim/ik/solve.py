@@ -75,7 +75,7 @@ def solve(
     search = Search(judged, start, restarts=restarts, seed=(seed,), hopeless=lambda: excluded(judged, start))
     form = closed_form(judged, start)
     found = search.solutions(np.zeros((0, judged.space.nq)) if form is None else form.q)
-    if len(found) and (all or not near):  # what is best may lie far from the start
+    if len(found) and (all or not near or not search.direct):  # what is best may lie elsewhere
         found = np.concatenate([found, search.more(restarts if all else 40)])
     if not len(found):
         nearest = brought(search)

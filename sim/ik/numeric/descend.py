@@ -12,7 +12,7 @@ from ..goals import Rows
 from ..problem import Problem
 
 Array = NDArray[np.float64]
-_LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
+LONGEST = 1.0  # [rad, or the model's length]: a step further than this leaves the linear model
 _STALL = 8  # iterations without progress that end an attempt
 _PROGRESS = 0.99
 _SHARP = 1e-12  # weighted residuals below this are met to rounding
@@ -116,7 +116,7 @@ def _steps(problem: Problem, q: Array, w: Rows, damping: Array) -> Array:
         A = JT @ J + damping[:, None, None] * np.eye(nv)
         d[:, columns] = -solved(A, JT @ w.r[:, :, None])[:, :, 0]
     longest = np.abs(d).max(axis=1, initial=0.0)
-    return np.asarray(d * np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None])
+    return np.asarray(d * np.minimum(1.0, LONGEST / np.maximum(longest, 1e-300))[:, None])
 
 
 def solved(A: Array, b: Array) -> Array:

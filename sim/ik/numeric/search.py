@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..chains.solver import racer_of
 from ..problem import Problem
-from .descend import Descent, descend
+from .descend import LONGEST, Descent, descend
 
 Array = NDArray[np.float64]
 AT_LIMIT = 1e-6  # [rad or m] beyond a limit: clipped, it may still be right
@@ -25,6 +25,7 @@ class Search:
     Attributes:
         used, iterations: random starts and iterations so far; never more starts than `restarts`.
         ends: costs of all attempts that failed; brought: of the best of them after `nearest.brought`.
+        direct: whether a closed form, or the start itself, led to a solution, and not far away.
         hopeless: asked once after the first starts; if it says so, few more are tried, for the nearest pose.
     """
 
@@ -39,6 +40,7 @@ class Search:
     ):
         self.problem, self.start, self.restarts, self.hopeless = problem, start, restarts, hopeless
         self.used = self.iterations = 0
+        self.direct = False
         self.ends: list[float] = []
         self.brought: list[float] = []
         self._seed, self._asked = seed, restarts
@@ -59,9 +61,12 @@ class Search:
         inside = first[space.excess(first).max(axis=1, initial=0.0) <= AT_LIMIT]
         if len(inside):
             found.append(self._attempt(inside, iterations=12))
+            self.direct = len(found[-1]) > 0
         if not len(found[-1]):
             starts = np.stack([self.start, space.middle(self.start, moved)])
             found.append(self._attempt(starts, iterations=40, first=True))
+            end = self._all[-1]
+            self.direct = bool(end.met[0]) and self._near(end.q[:1])
         if not len(found[-1]):
             if self.hopeless is not None and self.hopeless():
                 self.restarts = min(self.restarts, sum(_BLOCKS[:2]))
@@ -74,6 +79,10 @@ class Search:
             found.append(self._attempt(self._random(n), first=True))
             size = next(blocks, size)
         return np.concatenate(found)
+
+    def _near(self, q: Array) -> bool:
+        """Whether q (1, nq) is no further from the start than a linear model reaches."""
+        return bool(np.abs(self.problem.space.difference(q, self.start)).max(initial=0.0) <= LONGEST)
 
     def more(self, n: int) -> Array:
         """Further solutions (k, nq), from the start, mid-range and n random starts, or what is left."""
