@@ -152,3 +152,20 @@ def test_plotting_needs_no_display_and_leaves_no_global_state(recording, tmp_pat
     plot(recording, tmp_path / "p.png")
     assert matplotlib.get_backend() == before
     assert matplotlib._pylab_helpers.Gcf.get_num_fig_managers() == 0
+
+
+def test_a_scene_with_goals_shows_how_far_it_is_from_them():
+    goal = {
+        "at": "tip",
+        "times": [0, 0.5],
+        "position": [[0.45, 0, 0.4], [3, 0, 0.4]],
+        "rotation": [[0, 0, 0]] * 2,
+    }
+    shown = run(Scene(duration=0.5, models=[{"file": "arm6"}], goals=[goal]))
+    ax = figure(shown).axes[4]
+    drawn = {line.get_label(): line for line in ax.lines}
+    for k, unit in enumerate(("m", "rad")):
+        missed = np.maximum(shown.missed[:, 0, k], 1e-9)
+        np.testing.assert_allclose(drawn[f"pose tip [{unit}]"].get_ydata(), missed)
+    assert drawn["pose tip [m]"].get_ydata()[-1] > 1 and ax.get_yscale() == "log"
+    assert "m or rad" in ax.get_ylabel()

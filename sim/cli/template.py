@@ -36,6 +36,15 @@ joint = "elbow"
 times = [0, 1, 1.5, 2, 2.5, 4]
 values = [-60, -90, -60, -90, -60, -60]
 
+# Joints without keys are solved for goals, before the run or live ('pantograph plan' tells which).
+# [[goals]]
+# at = "tip"          # a site, or "body:NAME"
+# times = [0, 4]
+# position = [[0.4, 0, 0.4], [0.4, 0.2, 0.4]]
+# kind = "pose"       # point_on_line, point_on_plane, distance, center_of_mass, joint_value, posture, mirror,
+#                     # pole, spread, or lock: at = "left_foot", stances = [[0.2, 0.6]] holds a foot still
+# weight = 0.1        # a wish; without it, a hard goal
+
 # A loose thing.
 [[props]]
 name = "ball"
