@@ -1,30 +1,23 @@
 """Swing-up of underactuated pendulums: energy shaping, hand-over to LQR, and foresight between the two.
 
-Energy shaping after R. Lozano, I. Fantoni, D. Block (Systems & Control Letters 40, 2000) and X. Xin,
-M. Kaneda (Int. J. Robust Nonlinear Control 17, 2007), for any machine with one driven joint a: with E the
-energy, V = (E - E_up)^2 / 2 + kd v_a^2 / 2 + kp q_a^2 / 2 falls as -kv v_a^2 under
-tau = -(kv v_a + kp q_a + kd b) / (E - E_up + kd c), where v_a' = c tau + b. How soon such a motion passes the
-top slowly enough to be caught depends on gains and chance: the law therefore tries many gains on its model
-and takes those that arrive first, again and again until it has arrived.
+How soon a motion of shaped energy passes the top slowly enough to be caught depends on gains and chance: the
+law therefore tries many gains on its model and takes those that arrive first, again and again until it has
+arrived.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models import joint_names
 from ..sim.control import Target
-from ..sim.errors import PantographError, unknown
-from .basin import Catch, advance, comes_home
-from .gains import force_limits, positive, whole
-from .nominal import Nominal
+from .basin import advance
+from .energy_shaping import EnergyShaping
+from .gains import positive, whole
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -71,7 +64,8 @@ class SwingUp:
     ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, every
     ``every`` [s] until the catch has the machine; zero foresight takes the first set. Slides without range
     and hinges alike; slides must stay in their range with ``room`` [m] to spare. Hinges count modulo a turn.
-    Raises PantographError when the machine has not exactly one driven joint, or no such goal.
+    Keys of the driven joint play no part. Raises PantographError when the machine has not exactly one driven
+    joint, or no such goal.
     """
 
     def __init__(
@@ -88,104 +82,13 @@ class SwingUp:
         room: float = 0.05,
         seed: int = 1,
     ) -> None:
-        if int(tracked.sum()) != 1:
-            raise PantographError(f"swing-up needs exactly one tracked joint, got {int(tracked.sum())}")
+        tries, seed = whole("tries", tries), whole("seed", seed, least=0)
+        self.shaping = EnergyShaping(model, tracked, period, {} if goal is None else goal, tries, seed)
         self.model, self.tracked, self.period = model, tracked, period
-        self.nominal, self.a = Nominal(model), int(np.flatnonzero(tracked)[0])
-        self.low, self.high = force_limits(model)
+        self.nominal, self.a, self.tries, self.seed = self.shaping.nominal, self.shaping.a, tries, seed
+        self.low, self.high = self.shaping.low, self.shaping.high
         self.foresight, self.every = positive("foresight", foresight, zero=True), positive("every", every)
-        self.tries, self.seed = whole("tries", tries), whole("seed", seed, least=0)
         self.room = positive("room", room, zero=True)
-        if not np.isfinite(self.high[self.a] - self.low[self.a]):
-            raise PantographError(
-                "swing-up needs to know what the drive can give: set the actuator's ctrlrange"
-            )
-        self.given = dict(goal or {})
-        names = joint_names(model)
-        for name in self.given:
-            if name not in names:
-                raise PantographError(unknown("joint", name, names))
-
-    # ---- what is worked out once
-
-    @cached_property
-    def goal(self) -> Array:
-        """The equilibrium to reach, (nq,): every hinge at 0 or pi, highest in energy, unless it was given."""
-        m, names = self.model, joint_names(self.model)
-        free = [
-            j
-            for j in range(m.njnt)
-            if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and names[j] not in self.given
-        ]
-        base = np.zeros(m.nq)
-        for name, value in self.given.items():
-            base[m.jnt_qposadr[names.index(name)]] = value
-        choices = []
-        for turn in product((0.0, np.pi), repeat=len(free)):
-            q = base.copy()
-            q[m.jnt_qposadr[free]] = turn
-            choices.append(q)
-        heights = [float(self.nominal.smooth.energy(q, np.zeros(m.nv))[1]) for q in choices]
-        return choices[int(np.argmax(heights))]
-
-    @cached_property
-    def top(self) -> float:
-        """Energy at the goal [J]."""
-        return float(self.nominal.smooth.energy(self.goal, np.zeros(self.model.nv))[1])
-
-    @cached_property
-    def gains(self) -> Array:
-        """Sets of gains (tries, 4): natural frequency [rad/s] and damping of the driven joint, weight of its
-        motion in V relative to the energy to be gained, and part of the pull to its middle while pumping."""
-        rng = np.random.default_rng(self.seed)
-        w = self.rate * np.exp(rng.uniform(np.log(0.2), np.log(1.5), self.tries))
-        zeta = np.exp(rng.uniform(np.log(0.05), np.log(0.7), self.tries))
-        weight = np.exp(rng.uniform(np.log(0.01), np.log(1.0), self.tries))
-        pull = np.exp(rng.uniform(np.log(0.02), np.log(0.7), self.tries))
-        return np.stack([w, zeta, weight, pull], axis=1)
-
-    @cached_property
-    def rate(self) -> float:
-        """Fastest pole about the goal [rad/s]: the machine's own time scale."""
-        poles = np.abs(np.log(np.abs(np.linalg.eigvals(self.catch_open)))) / self.period
-        return float(max(poles.max(), 1e-3))
-
-    @cached_property
-    def catch_open(self) -> Array:
-        """A of the machine about its goal over one period."""
-        from .design.linear import held_matrices, linearise_path
-
-        still = np.zeros((1, self.model.nv))
-        path = (self.goal[None], still, still, self.nominal.weight(self.goal)[None])
-        return held_matrices(*linearise_path(self.nominal, *path, inputs=self.tracked), self.period)[0]
-
-    @cached_property
-    def catch(self) -> tuple[Catch, float]:
-        """The LQR about the goal and the value below which it brings the machine home.
-
-        States cost little beside forces: that makes the basin of cut forces wide. The level is the highest at
-        which 95 % of random states come home in simulation.
-        """
-        rng, n = np.random.default_rng(self.seed), self.model.nv
-        little = 1.0 / min(-self.low[self.a], self.high[self.a])
-        catch = Catch(
-            self.nominal, self.tracked, self.goal, self.period, reach=little, speed=10.0 * little / self.rate
-        )
-        root = np.linalg.cholesky(np.linalg.inv(catch.regulator.P))
-        x = rng.normal(size=(128, 2 * n))
-        x = (x / np.linalg.norm(x, axis=1)[:, None]) @ root.T
-
-        def works(size: float) -> bool:
-            q, v = self.goal + size * x[:, :n], size * x[:, n:]
-            home = comes_home(catch, q, v, (self.low, self.high), seconds=25.0 / self.rate)
-            return bool(home.mean() >= 0.95)
-
-        size = 1e-3
-        while size < 1e6 and works(2.0 * size):
-            size *= 2.0
-        for factor in (2.0**0.5, 2.0**0.25):
-            size *= factor if works(factor * size) else 1.0
-        return catch, size**2
 
     # ---- the law, on a batch of machines q, v (b, n)
 
@@ -193,62 +96,17 @@ class SwingUp:
         self, q: Array, v: Array, intent: Intent, tick: Array | int, caught: Mask
     ) -> tuple[Array, Mask, Array]:
         """Joint forces (b, nv) within the limits at a tick, who is in the catch's hands, and its value."""
-        catch, level = self.catch
+        catch, level = self.shaping.catch
         x = catch.state(q, v)
         value = catch.value(x)
         caught = value < np.where(caught, 9.0 * level, level)
-        pump = self._pump(q, v, x[:, self.a], self.gains[intent.choice])
+        pump = self.shaping.push(q, v, x[:, self.a], self.shaping.gains[intent.choice])
         part = ((tick - intent.begun) // intent.stretch).astype(np.intp)
         planned = part < intent.extra.shape[1]
         rows = np.arange(len(q))
         pump[:, self.a] += np.where(planned, intent.extra[rows, np.where(planned, part, 0)], 0.0)
         tau = np.where(caught[:, None], catch.force(x), pump)
         return np.clip(tau, self.low, self.high), caught, value
-
-    def _pump(self, q: Array, v: Array, where: Array, gains: Array) -> Array:
-        """Energy shaping, (b, nv), with the driven joints ``where`` (b,) from their goals."""
-        smooth, a = self.nominal.smooth, self.a
-        w, zeta, weight, pull = gains.T
-        kinetic, potential = smooth.energy(q, v)
-        missing = self.top - kinetic - potential
-        unit = np.zeros(self.model.nv)
-        unit[a] = 1.0
-        b = smooth.forward(q, v)[:, a]
-        c = smooth.forward(q, v, tau=unit)[:, a] - b
-        scale = self._lift * weight / self._mobility
-        spring = w**2 * where + 2.0 * zeta * w * v[:, a]
-        # while energy is missing the denominator may vanish: the sign of the pump is what counts then
-        below = scale * c - missing
-        safe = np.where(
-            np.abs(below) < 0.05 * scale * c, 0.05 * scale * c * np.where(below < 0, -1.0, 1.0), below
-        )
-        shaped = -(scale * (spring + b)) / safe
-        limit = np.minimum(-self.low[a], self.high[a])
-        push = (
-            limit
-            * np.clip(5.0 * missing / self._lift, -1.0, 1.0)
-            * np.sign(np.where(v[:, a] == 0.0, 1.0, v[:, a]))
-        )
-        pumped = push - pull * spring / c
-        tau = np.zeros_like(v)
-        tau[:, a] = np.where(below > 0.05 * scale * c, shaped, pumped)
-        return tau
-
-    @cached_property
-    def _lift(self) -> float:
-        """Energy between the lowest and the highest equilibrium [J]."""
-        low = self.goal.copy()
-        heights = []
-        hinges = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
-        for turn in product((0.0, np.pi), repeat=len(hinges)):
-            low[self.model.jnt_qposadr[hinges]] = turn
-            heights.append(float(self.nominal.smooth.energy(low, np.zeros(self.model.nv))[1]))
-        return max(self.top - min(heights), 1e-9)
-
-    @cached_property
-    def _mobility(self) -> float:
-        """Acceleration of the driven joint by its force at the goal [1/(kg m^2), 1/kg]."""
-        return float(np.linalg.inv(self.nominal.mass_matrix(self.goal))[self.a, self.a])
 
     def foresee(
         self,
@@ -262,7 +120,7 @@ class SwingUp:
         """What comes ``until`` (b,) ticks later of intentions (b,), several for each ``machine`` (b,): ticks
         until the catch has brought it well into its basin (infinite: another of the machine's is quicker, a
         limit is crossed, or it does not), the least value on the way, and ticks until then."""
-        b, (_, level) = len(q), self.catch
+        b, (_, level) = len(q), self.shaping.catch
         until = np.broadcast_to(until, b)
         home, least, when = np.full(b, np.inf), np.full(b, np.inf), np.zeros(b)
         rows, caught, inside = np.arange(b), np.zeros(b, dtype=bool), np.ones(b, dtype=bool)

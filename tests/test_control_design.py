@@ -520,7 +520,7 @@ def test_what_positions_show_is_observed():
     assert not observability(A, angle)
     verdict = detectability(A, angle)
     assert not verdict
-    assert "not detectable: nothing measured shows 0" in verdict.says
+    assert "not detectable: nothing measured shows slide (0 rad/s)" in verdict.says
     damped = LinearSystem(np.diag([-1.0, -2.0]), np.eye(2), ("a", "b"), ("a", "b"))
     assert not observability(damped, np.eye(2)[:1])
     assert "what nothing shows dies out" in detectability(damped, np.eye(2)[:1]).says

@@ -30,11 +30,11 @@ CART, ACROBOT = cart_law(foresight=6.0, tries=24), acrobot_law()
 
 
 def test_goals_are_upright():
-    np.testing.assert_array_equal(CART.goal, [0, 0])
-    np.testing.assert_array_equal(ACROBOT.goal, [np.pi, 0])
-    assert ACROBOT._lift == pytest.approx(2 * 9.81 * 3)
-    assert CART._lift == pytest.approx(2 * 0.2 * 9.81 * 0.3)
-    assert 1 / CART._mobility == pytest.approx(0.7 - (0.2 * 0.3) ** 2 / (0.006 + 0.2 * 0.3**2))
+    np.testing.assert_array_equal(CART.shaping.goal, [0, 0])
+    np.testing.assert_array_equal(ACROBOT.shaping.goal, [np.pi, 0])
+    assert ACROBOT.shaping.lift == pytest.approx(2 * 9.81 * 3)
+    assert CART.shaping.lift == pytest.approx(2 * 0.2 * 9.81 * 0.3)
+    assert 1 / CART.shaping.mobility == pytest.approx(0.7 - (0.2 * 0.3) ** 2 / (0.006 + 0.2 * 0.3**2))
 
 
 @given(seeds)
@@ -46,12 +46,12 @@ def test_energy_shaping_makes_its_function_fall(seed):
     q, v = rng.uniform(-np.pi, np.pi, (30, 2)), 3 * rng.normal(size=(30, 2))
     gains = np.tile(np.array([[2.0, 0.5, 3.0, 0.0]]), (30, 1))
     a, smooth = law.a, law.nominal.smooth
-    x = law.catch[0].state(q, v)[:, a]
-    tau = law._pump(q, v, x, gains)
+    x = law.shaping.catch[0].state(q, v)[:, a]
+    tau = law.shaping.push(q, v, x, gains)
     w, zeta, weight, _ = gains[0]
-    kd = law._lift * weight / law._mobility
+    kd = law.shaping.lift * weight / law.shaping.mobility
     acc = smooth.forward(q, v, tau=tau)
-    energy = np.add(*smooth.energy(q, v)) - law.top
+    energy = np.add(*smooth.energy(q, v)) - law.shaping.top
     rate = energy * tau[:, a] * v[:, a] + kd * v[:, a] * acc[:, a] + kd * w**2 * x * v[:, a]
     c = np.linalg.inv(smooth.mass_matrix(q))[:, a, a]
     shaped = kd * c + energy > 0.05 * kd * c
@@ -63,21 +63,27 @@ def test_energy_shaping_makes_its_function_fall(seed):
 @pytest.mark.parametrize("law", [CART, ACROBOT])
 def test_the_catch_holds_what_it_takes(law):
     """Fresh random states at the level: nearly all come home although forces are cut."""
-    catch, level = law.catch
+    catch, level = law.shaping.catch
     rng, n = np.random.default_rng(99), 2
     root = np.linalg.cholesky(np.linalg.inv(catch.regulator.P))
     x = rng.normal(size=(300, 2 * n))
     x = np.sqrt(level) * (x / np.linalg.norm(x, axis=1)[:, None]) @ root.T
-    q, v = law.goal + x[:, :n], x[:, n:]
+    q, v = law.shaping.goal + x[:, :n], x[:, n:]
     np.testing.assert_allclose(catch.value(catch.state(q, v)), level, rtol=1e-6)
-    home = comes_home(catch, q, v, (law.low, law.high), seconds=30 / law.rate)
+    home = comes_home(catch, q, v, (law.low, law.high), seconds=30 / law.shaping.rate)
     assert home.mean() > 0.85
-    far = comes_home(catch, law.goal + 6 * x[:, :n], 6 * x[:, n:], (law.low, law.high), seconds=30 / law.rate)
+    far = comes_home(
+        catch,
+        law.shaping.goal + 6 * x[:, :n],
+        6 * x[:, n:],
+        (law.low, law.high),
+        seconds=30 / law.shaping.rate,
+    )
     assert far.mean() < home.mean()
 
 
 def test_angles_count_modulo_a_turn():
-    catch, _ = ACROBOT.catch
+    catch, _ = ACROBOT.shaping.catch
     q, v = np.array([0.3 + np.pi, -0.2]), np.array([0.1, 0.4])
     for turns in ([2, -4], [-2, 0]):
         x = catch.state(q + np.pi * np.array(turns), v)
@@ -130,7 +136,7 @@ def test_weak_carts_stand_up_from_anywhere():
         q, v = advance(law.nominal, q, v, tau, 0.002, 5)
         worst = max(worst, np.abs(q[:, 0]).max())
         if tick > 1000:
-            assert np.abs(law.catch[0].state(q, v)[:, 1]).max() < 0.2
+            assert np.abs(law.shaping.catch[0].state(q, v)[:, 1]).max() < 0.2
     assert worst < 1.0
 
 
@@ -163,10 +169,10 @@ def test_what_is_foreseen_comes_true():
     caught, first = np.zeros(len(q), dtype=bool), np.full(len(q), np.inf)
     for tick in range(1000):
         tau, caught, value = law.force(q, v, intent, tick, caught)
-        first = np.where(caught & (value < 0.1 * law.catch[1]), np.minimum(first, tick), first)
+        first = np.where(caught & (value < 0.1 * law.shaping.catch[1]), np.minimum(first, tick), first)
         q, v = advance(law.nominal, q, v, tau, law.period / 8, 8)
     np.testing.assert_allclose(first, home, atol=30)
-    assert np.abs(law.catch[0].state(q, v)[:, :2]).max() < 0.5
+    assert np.abs(law.shaping.catch[0].state(q, v)[:, :2]).max() < 0.5
 
 
 def test_the_basin_of_a_double_pole_lies_around_upright():

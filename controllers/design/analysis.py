@@ -142,8 +142,12 @@ def _lasting(modes: tuple[Mode, ...]) -> tuple[Mode, ...]:
 def _verdict(word: str, more: str, failing: tuple[Mode, ...], otherwise: str) -> Verdict:
     if not failing:
         return Verdict(True, (), f"{word}{more}")
-    shown = [mode for mode in failing if mode.pole.imag >= 0.0]  # one of each pair
-    return Verdict(False, failing, otherwise + ", ".join(map(str, shown)))
+    groups: dict[str, list[str]] = {}
+    for mode in failing:
+        if mode.pole.imag >= 0.0:  # one of each pair
+            groups.setdefault(mode.of, []).append(f"{mode.frequency:.3g}")
+    said = ", ".join(f"{of} ({', '.join(rates)} rad/s)" for of, rates in groups.items())
+    return Verdict(False, failing, otherwise + said)
 
 
 def closed_loop(system: LinearSystem, K: ArrayLike) -> LinearSystem:

@@ -131,7 +131,7 @@ def swing(
         tau, memory = law.batch(q, v, memory)
         path = smooth.rollout(q, v, tau[:, None, driven : driven + 1], step=PERIOD / 10, steps=10, hold=10)
         q, v = path.q[:, -1].copy(), path.v[:, -1].copy()
-        x = law.catch[0].state(q, v)
+        x = law.shaping.catch[0].state(q, v)
         tilt = np.abs(x[:, 1]) if which == "cart-pole" else np.abs([x[:, 0], x[:, 0] + x[:, 1]]).max(axis=0)
         down = np.where(tilt > 0.5, (tick + 1) * PERIOD, down)
         if which == "cart-pole":
