@@ -384,6 +384,30 @@ def test_a_folder_that_cannot_be_made_is_told_in_a_line(pantograph, folder):
         assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ({"PYOPENGL_PLATFORM": "glx"}, "PYOPENGL_PLATFORM is 'glx', which needs a window"),
+        ({}, "films need PyAV, which does not load (no libavcodec)"),
+    ],
+)
+def test_a_film_that_cannot_be_made_is_told_before_the_run(folder, setting, says):
+    if not setting:
+        (folder / "av").mkdir()
+        (folder / "av" / "__init__.py").write_text("raise ImportError('no libavcodec')\n")
+        setting = {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
+    process = subprocess.run(
+        [sys.executable, "-m", "pantograph.sim", "run", "swing.toml", "--film", "swing.mp4"],
+        env={**os.environ, **setting},
+        capture_output=True,
+        text=True,
+    )
+    assert process.returncode == 2
+    assert process.stderr.startswith(f"error: {says}")
+    assert "Traceback" not in process.stderr
+    assert not list((folder / "out").glob("*.npz"))
+
+
 INTERRUPTING = """\
 import importlib, os, signal, sys
 os.kill(os.getpid(), signal.SIGINT)

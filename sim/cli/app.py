@@ -267,8 +267,10 @@ def _foresee(plan: Any, out: Path, film: Path | None, rig: str | None) -> None:
     check_writable(out)
     if film is not None:
         from ..film import check_path
+        from ..film.context import Context
 
         check_path(_in(out, film))
+        Context().close()
     if rig is not None:
         from ...hardware.rig import check_model, load_rig
 

@@ -57,8 +57,22 @@ def write(
 
 
 def check_path(path: str | os.PathLike[str]) -> None:
-    """Raise FilmError for a path that no film can have by its ending."""
-    _writer_of(Path(path))
+    """Raise FilmError for a path that no film can have by its ending, or without the library for it."""
+    if _writer_of(Path(path)) in (_write_mp4, _write_gif):
+        _av()
+
+
+def _av() -> Any:
+    """PyAV. Raises FilmError where it does not load."""
+    try:
+        import av
+        import av.video.reformatter
+    except ImportError as error:
+        raise FilmError(
+            f"films need PyAV, which does not load ({error}): pip install --force-reinstall av; single "
+            "frames do without: name a folder, or name_%04d.png"
+        ) from error
+    return av
 
 
 def check_rate(fps: float) -> None:
@@ -145,9 +159,7 @@ class _Kept:
 
 
 def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
-    import av
-    from av.video.reformatter import Colorspace
-
+    av = _av()
     kept = _Kept()
     options = {"movflags": "faststart"}
     with _aside(target) as aside, av.open(str(aside), "w", format="mp4", options=options) as container:
@@ -163,7 +175,7 @@ def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
                     for name in ("colorspace", "color_primaries", "color_trc"):
                         setattr(stream.codec_context, name, 1)  # BT.709, the colours of clear pictures
                 picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(
-                    format="yuv420p", dst_colorspace=Colorspace.ITU709
+                    format="yuv420p", dst_colorspace=av.video.reformatter.Colorspace.ITU709
                 )
                 container.mux(stream.encode(picture))
                 kept.frames += 1
@@ -172,8 +184,9 @@ def _write_mp4(target: Path, frames: Iterator[Frame], fps: float) -> None:
 
 
 def _write_gif(target: Path, frames: Iterator[Frame], fps: float) -> None:
-    import av
     from PIL import Image
+
+    av = _av()
 
     kept = _Kept()
     with _aside(target) as aside, tempfile.TemporaryFile() as spool:
