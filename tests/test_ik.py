@@ -82,6 +82,7 @@ def test_jacobians_of_goals_are_their_derivatives(model, seed):
         Position(a, x), Position(a, x, relative_to=b), Orientation(a, quat),
         Pose(a, x, quat, relative_to="s0"),
         LookAt(a, 5 * x, axis=y), PointOnLine(a, x, y), PointOnPlane(a, x, y), Distance(a, 3 * x, 1.0),
+        PointOnLine(a, x, y, b), PointOnPlane(a, x, y, b),
         Posture(model.qpos0), Mirror(a, "s0", y, x, relative_to=b), Pole(a, "s0", b, x),
     ]  # fmt: skip
     if model.nv:

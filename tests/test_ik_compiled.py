@@ -78,6 +78,7 @@ def test_programs_of_goals_compute_their_rows(model, seed):
         Position(a, x), Position(a, x, relative_to=b), Orientation(a, quat),
         Pose(a, x, quat, relative_to="s0"), Orientation(b, quat, relative_to=a),
         LookAt(a, 5 * x, axis=y), PointOnLine(a, x, y), PointOnPlane(a, x, y), Distance(a, 3 * x, 1.0),
+        PointOnLine(a, x, y, b), PointOnPlane(b, x, y, a),
         Distance(a, b, 0.5), Posture(q[1]), Mirror(a, "s0", y, x, relative_to=b), Pole(a, "s0", b, x),
         LookAt(a, 5 * x, axis=y, relative_to=b), Mirror(a, b, y, x, what="pose", flip=y[::-1]),
         Mirror(b, a, y, relative_to="s0", what="orientation"),

@@ -8,7 +8,7 @@ from oracles import ik_cases
 from oracles.derivatives import assert_derivative
 from pantograph.models import ModelError, load_model
 from pantograph.sim import rotations
-from pantograph.sim.ik import LookAt, Mirror, solve
+from pantograph.sim.ik import LookAt, Mirror, PointOnLine, PointOnPlane, solve
 from pantograph.sim.ik.pose import Kinematics
 from pantograph.sim.ik.space import Space
 from strategies import random_states, seeds, trees
@@ -127,6 +127,20 @@ def test_sight_of_a_frames_point_is_that_of_the_point_in_the_world(model, seed):
     np.testing.assert_allclose(
         one.rows(kinematics.at(q)).r, two.rows(kinematics.at(q)).r, atol=1e-7 * (1 + np.abs(there).max())
     )
+
+
+@settings(max_examples=15, deadline=None)
+@given(trees(), seeds)
+def test_lines_and_planes_of_a_frame_are_those_of_the_world_turned_and_moved_with_it(model, seed):
+    rng = np.random.default_rng(seed)
+    q = random_states(model, seed, 1)[0]
+    a, b = (f"s{k}" for k in rng.integers(0, model.nsite, 2))
+    (p, quat), (x, y) = ik_cases.pose_of(model, q[0], b), rng.normal(size=(2, 3))
+    R, kinematics = rotations.to_matrix(quat), Kinematics(model)
+    for kind in (PointOnLine, PointOnPlane):
+        one, two = kind(a, x, y, relative_to=b), kind(a, p + R @ x, R @ y)
+        far = [np.linalg.norm(goal.rows(kinematics.at(q)).r) for goal in (one, two)]
+        assert far[0] == pytest.approx(far[1], abs=1e-7 * (1 + far[1]))
 
 
 def test_a_mirror_of_nothing_is_a_mistake():

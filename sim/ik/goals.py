@@ -278,11 +278,13 @@ class LookAt(Goal):
 
 @dataclass(frozen=True, eq=False)
 class PointOnLine(Goal):
-    """The origin of `at` lies on the line through `point` along `direction`."""
+    """The origin of `at` lies on the line through `point` along `direction`, in axes of the world or those of
+    `relative_to`."""
 
     at: str
     point: ArrayLike
     direction: ArrayLike
+    relative_to: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -290,24 +292,26 @@ class PointOnLine(Goal):
         object.__setattr__(self, "direction", unit("direction", self.direction))
 
     def frames(self) -> tuple[str, ...]:
-        return (self.at,)
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
     def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",) * 2
 
     def rows(self, c: Configurations) -> Rows:
-        f = c.frame(self.at)
+        f = seen_from(c, self.at, self.relative_to)
         across = np.linalg.svd(np.asarray(self.direction)[None])[2][1:]  # two unit vectors across the line
         return Rows((f.p - np.asarray(self.point)) @ across.T, across @ f.Jv)
 
 
 @dataclass(frozen=True, eq=False)
 class PointOnPlane(Goal):
-    """The origin of `at` lies in the plane through `point` with unit `normal`."""
+    """The origin of `at` lies in the plane through `point` with `normal`, in axes of the world or those of
+    `relative_to`."""
 
     at: str
     point: ArrayLike
     normal: ArrayLike
+    relative_to: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -315,13 +319,13 @@ class PointOnPlane(Goal):
         object.__setattr__(self, "normal", unit("normal", self.normal))
 
     def frames(self) -> tuple[str, ...]:
-        return (self.at,)
+        return (self.at,) if self.relative_to is None else (self.at, self.relative_to)
 
     def units(self, model: mujoco.MjModel) -> tuple[Unit, ...]:
         return ("m",)
 
     def rows(self, c: Configurations) -> Rows:
-        f, n = c.frame(self.at), np.asarray(self.normal)
+        f, n = seen_from(c, self.at, self.relative_to), np.asarray(self.normal)
         return Rows((f.p - np.asarray(self.point)) @ n[:, None], n[None] @ f.Jv)
 
 

@@ -104,13 +104,13 @@ def _look_at(scene: Scene, goal: LookAt, t: Vector) -> list[Row]:
 
 
 def _on_line(scene: Scene, goal: PointOnLine, t: Vector) -> list[Row]:
-    f = scene.frame(goal.at)
+    f = scene.seen_from(goal.at, goal.relative_to)
     across = [t[3:6], t[6:9]]
     return _rows(times(across, minus(f.p, t[:3])), _each(f.u, across))
 
 
 def _on_plane(scene: Scene, goal: PointOnPlane, t: Vector) -> list[Row]:
-    f = scene.frame(goal.at)
+    f = scene.seen_from(goal.at, goal.relative_to)
     return _rows([dot(t[3:6], minus(f.p, t[:3]))], _each(f.u, [t[3:6]]))
 
 

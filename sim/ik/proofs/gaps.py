@@ -117,6 +117,8 @@ def _axis(f: Frame, joint: Any, q: Array) -> Array:
 
 def _surface_gap(problem: Problem, goal: PointOnPlane | PointOnLine, q: Array) -> float:
     """Distance of plane or line from the ball around the first anchor that the chain stays within."""
+    if goal.relative_to is not None:
+        return 0.0
     f = problem.kinematics.frame(goal.at)
     base = at_point(np.asarray(goal.point), problem.space.nq, problem.space.nv)
     hops = path(base, f, problem.space, problem.moved, q)
