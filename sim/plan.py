@@ -189,9 +189,9 @@ def _engines(scene: Scene, reasons: list[str]) -> list[Mistake]:
         message = f"{solver.integrator!r} belongs to {no_smooth}"
         mistakes.append(Mistake(("solver", "integrator"), message))
     by_contact = solver.engine == "contact" or contact_only
-    if solver.tolerance is not None and (by_contact or reasons):
+    if solver.tolerance is not None and (solver.engine == "contact" or reasons):
         why = "the contact engine, which runs this scene, steps at a fixed rate"
-        why += "" if by_contact else f", and not the smooth one, since {reasons[0]}"
+        why += "" if solver.engine == "contact" else f", and not the smooth one, since {reasons[0]}"
         mistakes.append(Mistake(("solver", "tolerance"), f"{why}; use 'step'"))
     if scene.physics.restitution and (by_contact or reasons) and scene.physics.limits:
         message = f"rebounds belong to {no_smooth}"

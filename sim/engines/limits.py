@@ -50,8 +50,8 @@ def complementary(W: Array, b: Array) -> Array:
     return np.asarray(nnls(L.T, -np.linalg.solve(L, b))[0])
 
 
-def rebound(W: Array, u: Array, restitution: float) -> Array:
-    """Velocities away from their limits after an impact of joints that come with velocities `u`.
+def rebound(W: Array, u: Array, restitution: float) -> tuple[Array, Array]:
+    """Impulses of an impact of joints that come with velocities `u` away from their limits, and theirs after.
 
     Impulses p >= 0 give u+ = u + W p, W = J M^-1 J', with W p + (1 + e) u >= 0 and p (W p + (1 + e) u) = 0
     (Newton's restitution e): the kinetic energy changes by (1 - e) p u / 2 <= 0. Where that throws one joint
@@ -65,8 +65,8 @@ def rebound(W: Array, u: Array, restitution: float) -> Array:
         e = restitution if restitution * closing > STILL and again < _MOST else 0.0
         p = complementary(W, (1.0 + e) * u)
         impulse += p
-        u += W @ p
-    return impulse
+        u = np.where(p > 0.0, -e * u, u + W @ p)  # the one where the other would be it to rounding
+    return impulse, u
 
 
 def slack(force: Array) -> Array:

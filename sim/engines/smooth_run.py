@@ -267,14 +267,15 @@ class Run(ABC):
         inverse = np.linalg.inv(c.smooth.mass_matrix(self.q[c.q_free], w=w))[:, dof] * side
         W = side[:, None] * inverse[dof]
         u = side * self.v[c.v_free[dof]]
-        impulse = np.zeros(len(at))
+        scale = 1.0 + np.abs(u).max(initial=0.0)
         if hit is not None:
             self._note("limit", hit)
             self.q[hit.qpos] = hit.bound
-            impulse = rebound(W, u, self.problem.restitution)
+            u[at.index(hit)] = min(0.0, u[at.index(hit)])  # back before rounding lets it see a gap
+            impulse, u = rebound(W, u, self.problem.restitution)
             self.v[c.v_free] += inverse @ impulse
-        stays = np.abs(u + W @ impulse) <= 1e-12 * (1.0 + np.abs(u).max(initial=0.0))
-        self.v[c.v_free[dof[stays]]] = 0.0
+        stays = np.abs(u) <= 1e-12 * scale
+        self.v[c.v_free[dof]] = np.where(stays, 0.0, side * u)
         a = c.smooth.forward(self.q[c.q_free], self.v[c.v_free], c.held(self.held), act=self.act, w=w)
         away, W = side[stays] * a[dof[stays]], W[np.ix_(stays, stays)]
         force = complementary(W, away)
