@@ -238,7 +238,11 @@ def even_nodes(clip: Clip, by: Measure, points: int) -> Array:
         np.linspace(a, b, max(3, round(0.5 * points * (b - a))) + 1)[1:-1]
         for a, b in pairwise(np.interp(fixed, s, even))
     ]
-    return _apart(np.union1d(np.interp(np.concatenate(parts), even, s), fixed))
+    nodes = _apart(np.union1d(np.interp(np.concatenate(parts), even, s), fixed))
+    # the shorter a piece, the more rounding of positions is in its accelerations
+    short = _lengths(clip, by, nodes) < 1e-5 * p[-1]
+    last = np.isin(nodes, fixed)
+    return nodes[last | ~(np.append(short, False) | np.append(False, short))]
 
 
 def _apart(nodes: Array) -> Array:

@@ -68,7 +68,8 @@ def smooth(
         known = [_timed(clip, machine, grid, *pair, back, keep) for pair in zip(rows, known, strict=True)]
         now = _stitched(clip, machine, rows, known)
         at = _quintics(clip, now)
-        coarse = now.s[:-1][by_piece(machine, *at(1.0)) > _NEAR]
+        long = np.diff(now.t) > 1e-4 * now.t[-1]
+        coarse = now.s[:-1][(by_piece(machine, *at(1.0)) > _NEAR) & long]
         if not len(coarse) or len(now.s) + len(coarse) > most:
             break
         rows = [row if row.by is None else row._replace(nodes=_halved(row.nodes, coarse)) for row in rows]
