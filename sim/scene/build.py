@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from ...models import captured_warnings, name_of
 from ..clip import Clip
-from ..control import is_position_servo, why_not_controllable
-from ..engines.interface import Aims, Array, Drive, Role, State, Wrench
+from ..engines.interface import Aims, Array, Role, State, Wrench
 from ..engines.prescribe import prescribed_bodies
 from ..errors import PantographError, SceneError
-from ..kinds import BALL, FREE, HINGE, SCALAR
+from ..kinds import BALL, FREE, HINGE
 from .assemble import apply_contacts, assemble, exclude_prescribed, name_everything
+from .drives import drives_of
 from .floors import Floors, unite
 from .goals import Goals, assign, bake
 from .live import chaser, settle_roles, streamed
@@ -87,7 +87,7 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     mistakes += _film_names(scene, model)
     if mistakes:
         # drives need settled roles; their own mistakes still belong into the report
-        return None, mistakes + _drives(scene, model, roles, found, goals)[2]
+        return None, mistakes + drives_of(scene, model, roles, found, goals)[2]
     try:
         clip, coupled = _clip(model, found, roles, state0.q)
     except PantographError as e:
@@ -99,7 +99,7 @@ def resolve(scene: Scene) -> tuple[Setup | None, list[Mistake]]:
     clip = Clip(model, clip.tracks, clip.q0)
     _switches(scene, model)
     _silence_equalities(model, prescribed, roles)
-    drives, servo, wrong = _drives(scene, model, roles, found, goals, clip)
+    drives, servo, wrong = drives_of(scene, model, roles, found, goals, clip)
     if wrong:
         return None, wrong
     state0 = _start_on_keys(scene, model, roles, clip, state0)
@@ -261,83 +261,6 @@ def _wrenches(scene: Scene, model: mujoco.MjModel) -> tuple[tuple[Wrench, ...], 
         stop = np.inf if item.stop is None else item.stop
         out.append(Wrench(body, force, torque, item.frame == "body", start, stop))
     return tuple(out), mistakes
-
-
-def _drives(
-    scene: Scene,
-    model: mujoco.MjModel,
-    roles: NDArray[np.int8],
-    found: Curves,
-    goals: Goals,
-    clip: Clip | None = None,
-) -> tuple[NDArray[np.int8], dict[int, Callable[[Array], Array]], list[Mistake]]:
-    """What drives each actuator, as the scene says or as its joint's role suggests."""
-    actuators, mistakes = Names(model, "actuator"), []
-    drives = np.array(
-        [_suggested(scene, model, roles, found, goals, i) for i in range(model.nu)], dtype=np.int8
-    )
-    said: dict[int, str] = {}
-    for pattern, word in scene.actuators.items():
-        ids = actuators.match(pattern)
-        if not ids:
-            mistakes.append(Mistake(("actuators", pattern), actuators.missing(pattern)))
-        for i in ids:
-            drives[i] = Drive[word.upper()]
-            said[i] = pattern
-    servo: dict[int, Callable[[Array], Array]] = {}
-    for i in range(model.nu):
-        path = ("actuators", said[i]) if i in said else ("actuators",)
-        name = name_of(model, "actuator", i)
-        if drives[i] == Drive.OFF:
-            model.actuator_gainprm[i] = 0.0
-            model.actuator_biasprm[i] = 0.0
-        elif drives[i] == Drive.CONTROLLER:
-            if reason := why_not_controllable(model, i):
-                mistakes.append(Mistake(path, f"no controller can drive actuator {name!r}: {reason}"))
-        elif _on_joint(model, i) and int(model.actuator_trnid[i, 0]) in goals.live_joints:
-            message = (
-                f"actuator {name!r} drives a joint that follows a live goal: 'controller' drives it, not keys"
-            )
-            mistakes.append(Mistake(path, message))
-        elif i in found.actuators:
-            curve = found.actuators[i]
-            servo[i] = lambda t, curve=curve: curve(t).q[:, 0]  # type: ignore[misc]
-        elif is_position_servo(model, i) and _on_joint(model, i):
-            if clip is not None:
-                servo[i] = _servo_along_keys(model, clip, i)
-        else:
-            message = f"actuator {name!r} is driven by keys but has none: add [[keys]] actuator = {name!r}"
-            mistakes.append(Mistake(path, message, needs=("keys",)))
-    return drives, servo, mistakes
-
-
-def _suggested(
-    scene: Scene, model: mujoco.MjModel, roles: NDArray[np.int8], found: Curves, goals: Goals, i: int
-) -> Drive:
-    if i in found.actuators:
-        return Drive.KEYS
-    if not _on_joint(model, i):
-        return Drive.OFF
-    if roles[model.actuator_trnid[i, 0]] != Role.TRACKED:
-        return Drive.OFF
-    servo = is_position_servo(model, i)
-    if why_not_controllable(model, i):
-        return Drive.KEYS if servo else Drive.OFF
-    live = int(model.actuator_trnid[i, 0]) in goals.live_joints
-    return Drive.KEYS if servo and scene.controller is None and not live else Drive.CONTROLLER
-
-
-def _on_joint(model: mujoco.MjModel, i: int) -> bool:
-    joint = int(model.actuator_trnid[i, 0])
-    on = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-    return bool(on) and int(model.jnt_type[joint]) in SCALAR
-
-
-def _servo_along_keys(model: mujoco.MjModel, clip: Clip, i: int) -> Callable[[Array], Array]:
-    """Control of a position servo that follows its joint's keys: ctrl = gear q."""
-    column = int(model.jnt_qposadr[model.actuator_trnid[i, 0]])
-    gear = float(model.actuator_gear[i, 0])
-    return lambda t: np.asarray(gear * clip.evaluate(t).q[:, column])
 
 
 def _clip(
