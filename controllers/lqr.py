@@ -14,10 +14,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models import dof_names
 from ..sim.clip import Clip
 from ..sim.control import Target
+from ..sim.errors import PantographError
 from .design.linear import held_matrices, linearise_path
-from .design.riccati import along, dlqr
+from .design.riccati import Regulator, along, dlqr
 from .gains import Gain, force_weights, per_joint, positive
 from .nominal import Nominal, difference
 from .preview import Preview, aimed
@@ -37,6 +39,18 @@ class Solution(NamedTuple):
     K: Array
     P: Array
     u: Array
+
+
+def regulator(
+    model: mujoco.MjModel, free: NDArray[np.bool_], A: Array, B: Array, Q: Array, R: Array
+) -> Regulator:
+    """:func:`~pantograph.controllers.design.riccati.dlqr` for the freedoms ``free`` (nv,), whose mistakes
+    name joints."""
+    names = dof_names(model)
+    try:
+        return dlqr(A, B, Q, R, states=tuple(names[i] for i in np.flatnonzero(free)) * 2)
+    except PantographError as e:
+        raise PantographError(f"{e}; track, key or damp what is left to itself") from None
 
 
 class LQR:
@@ -90,7 +104,7 @@ class LQR:
         continuous = linearise_path(self.nominal, q, v, a, tau, inputs=self.tracked, keyed=self.keyed)
         A, B = held_matrices(*continuous, self.period)
         if self.final is None:
-            last = dlqr(A[-1], B[-1], self.Q, self.R)
+            last = regulator(self.model, ~self.keyed, A[-1], B[-1], self.Q, self.R)
             if rest:
                 return Solution(A, B, last.K[None], np.array([last.P, last.P]), tau[:, self.tracked])
             end = last.P

@@ -16,6 +16,7 @@ from ..sim.compose import make_engine, make_law
 from ..sim.control import Law, Sampled, Target
 from ..sim.engines.common import Broken
 from ..sim.engines.interface import Controls, Held, Problem, Role
+from ..sim.errors import PantographError
 from ..sim.plan import Plan
 from .gains import force_limits
 from .ilc import Fed, Learned, learn
@@ -141,7 +142,10 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     else:
         made = make_law(law, problem, dict(words), period)
     q, v, _ = problem.state0
-    made(0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start())  # builds what the law needs
+    try:
+        made(0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start())  # builds what the law needs
+    except PantographError as e:
+        raise PantographError(f"law {law!r}: {e}") from e
     build = time.perf_counter() - begun
     watched = _Watched(made, force_limits(problem.model))
     controls = _Pushed(Sampled(watched, true, period), disturbance)

@@ -325,6 +325,23 @@ def test_what_to_do_is_for_all_laws_that_can():
     assert all(np.abs(result.trials[law].error[-1]).max() < 0.05 for law in ("lqr", "mpc"))
 
 
+def test_a_law_that_cannot_be_made_is_named_with_what_it_cannot_steer():
+    """A roll axis that nothing drives: no force of the other joints turns it."""
+    others = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch"]
+    scene = Scene(
+        duration=0.1,
+        models=[{"file": "arm6"}],
+        roles={"tracked": others},
+        actuators={"*": "off"},
+        keys=[{"joint": j, "times": [0], "values": [0.3]} for j in others],
+        physics={"friction": False, "contacts": "none", "gravity": False},
+        controller={"law": "pd"},
+    )
+    message = r"law 'lqr': no regulator exists: no input can steer tool_roll; track, key or damp"
+    with pytest.raises(PantographError, match=message):
+        compare(scene, ["pd", "lqr"], processes=1)
+
+
 def test_a_scene_without_anything_to_control_is_refused():
     scene = Scene(duration=1.0, models=[{"file": "pendulum"}])
     with pytest.raises(PantographError, match="nothing to control"):

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from ...sim.errors import PantographError
-from .analysis import hidden_modes, unsteerable_modes
+from .analysis import Mode, hidden_modes, unsteerable_modes
 
 Array = NDArray[np.float64]
 
@@ -37,14 +37,22 @@ class Regulator:
             array.setflags(write=False)
 
 
-def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None = None) -> Regulator:
+def lqr(
+    A: ArrayLike,
+    B: ArrayLike,
+    Q: ArrayLike,
+    R: ArrayLike,
+    N: ArrayLike | None = None,
+    *,
+    states: tuple[str, ...] = (),
+) -> Regulator:
     """Least integral of x'Q x + u'R u + 2 x'N u under dx/dt = A x + B u.
 
-    Raises PantographError for weights that make no sense, and naming the modes that no input can steer or
-    no weight sees when these are unstable.
+    Raises PantographError for weights that make no sense, and naming the modes (with ``states``, where they
+    are seen) that no input can steer or no weight sees when these do not die out by themselves.
     """
     A, B, Q, R, N = _checked(A, B, Q, R, N)
-    _solvable(A, B, Q, R, N, discrete=False)
+    _solvable(A, B, Q, R, N, states, discrete=False)
     P = linalg.solve_continuous_are(A, B, Q, R, s=N)
     for _ in range(2):
         K = linalg.solve(R, B.T @ P + N.T, assume_a="pos")
@@ -56,10 +64,18 @@ def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | N
     return _regulator(A, B, K, P, rest)
 
 
-def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None = None) -> Regulator:
+def dlqr(
+    A: ArrayLike,
+    B: ArrayLike,
+    Q: ArrayLike,
+    R: ArrayLike,
+    N: ArrayLike | None = None,
+    *,
+    states: tuple[str, ...] = (),
+) -> Regulator:
     """Least sum of x'Q x + u'R u + 2 x'N u under x+ = A x + B u; raises as :func:`lqr`."""
     A, B, Q, R, N = _checked(A, B, Q, R, N)
-    _solvable(A, B, Q, R, N, discrete=True)
+    _solvable(A, B, Q, R, N, states, discrete=True)
     P = linalg.solve_discrete_are(A, B, Q, R, s=N)
     for _ in range(2):
         K = _gain(A, B, P, R, N)
@@ -127,17 +143,23 @@ def _checked(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLik
     return [A, B, Q, R, cross]
 
 
-def _solvable(A: Array, B: Array, Q: Array, R: Array, N: Array, *, discrete: bool) -> None:
-    stuck = [m for m in unsteerable_modes(A, B, discrete=discrete) if not m.stable]
+def _solvable(
+    A: Array, B: Array, Q: Array, R: Array, N: Array, states: tuple[str, ...], *, discrete: bool
+) -> None:
+    stuck = [m for m in unsteerable_modes(A, B, discrete=discrete, states=states) if not m.stable]
     if stuck:
-        raise PantographError(
-            "no regulator exists: no input can steer the mode " + "; ".join(map(str, stuck))
-        )
+        raise PantographError(f"no regulator exists: no input can steer {_seen(stuck, 'the mode ')}")
     inner = A - B @ np.linalg.solve(R, N.T)
     unseen = [
         m
-        for m in hidden_modes(inner, Q - N @ np.linalg.solve(R, N.T), discrete=discrete)
+        for m in hidden_modes(inner, Q - N @ np.linalg.solve(R, N.T), discrete=discrete, states=states)
         if abs(m.damped if not discrete else 1.0 - abs(m.pole)) < 1e-9
     ]
     if unseen:
-        raise PantographError("no regulator exists: no weight sees the mode " + "; ".join(map(str, unseen)))
+        raise PantographError(f"no regulator exists: no weight sees {_seen(unseen, 'the mode ')}")
+
+
+def _seen(modes: list[Mode], otherwise: str) -> str:
+    """The states where modes are seen, or the modes."""
+    names = dict.fromkeys(mode.of for mode in modes if mode.of)
+    return ", ".join(names) or otherwise + "; ".join(map(str, modes))

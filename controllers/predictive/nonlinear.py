@@ -21,8 +21,9 @@ from ...sim.control import Target
 from ...sim.errors import PantographError
 from ...sim.kinds import FREE, SCALAR
 from ..design.linear import held_matrices, linearise_path
-from ..design.riccati import Regulator, dlqr
+from ..design.riccati import Regulator
 from ..gains import Gain, force_limits, force_weights, per_joint, positive, whole
+from ..lqr import regulator
 from ..nominal import Nominal
 from ..preview import aimed
 from .shooting import Horizon, Plan, Shooting, Weights
@@ -103,7 +104,8 @@ class NMPC:
         path = (q[None], still, still, self.nominal.weight(q)[None])
         made = linearise_path(self.nominal, *path, inputs=self.tracked, keyed=self.keyed)
         A, B = held_matrices(*made, self.step)
-        return dlqr(A[0], B[0], np.diag(np.maximum(self.Q, 1e-12)), np.diag(self.R))
+        Q = np.diag(np.maximum(self.Q, 1e-12))
+        return regulator(self.model, ~self.keyed, A[0], B[0], Q, np.diag(self.R))
 
     def horizon(self, t: float) -> Horizon:
         """References from time ``t`` [s] on."""
