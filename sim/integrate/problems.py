@@ -8,7 +8,6 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from ..engines.touch import can_touch
 from ..errors import EngineError
 from .tableau import Array
 
@@ -122,6 +121,8 @@ class MujocoProblem:
 
 def constraints_of(model: mujoco.MjModel) -> list[str]:
     """What in the model MuJoCo treats as a constraint, in words; empty when its dynamics is smooth."""
+    from ..engines.touch import can_touch  # with the engines' interface: the dynamics alone need none
+
     off = model.opt.disableflags
     flag = mujoco.mjtDisableBit
 
