@@ -27,15 +27,15 @@ class Verdict:
 
     Attributes:
         kind: what was found.
-        proved: a bound or a closed form says so; otherwise only that `restarts` searches found nothing else.
-            An answer that meets its goals is its own proof.
+        proved: a bound, a closed form or a subdivision says so; otherwise only that searches from `restarts`
+            random starts found nothing else. An answer that meets its goals is its own proof.
         reason: in words.
         position, rotation: how far out of reach [m], [rad]; each with the other held where a pose's two parts
             can be met only apart. Limits of joints count unless limits alone are the reason (then 0).
         bound: proved least distance [m] (out of reach or conflict), 0 without one.
         joints: joints whose limits hold the goals back, with how far beyond them [rad or m] a solution lies.
         goals: goals that cannot be met (together).
-        restarts: searches that ended without meeting the goals.
+        restarts: random starts that were made, besides the start and mid-range.
     """
 
     kind: Kind

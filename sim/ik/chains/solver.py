@@ -116,6 +116,8 @@ def _limits(space: Space, frame: Frame) -> Array:
 class ChainSolver:
     """Inverse kinematics of one frame of a fixed chain in microseconds, for live use; no verdict, no wishes.
 
+    Starts besides the seed are the same for every question, so that answers repeat bit for bit.
+
     >>> arm = ChainSolver(model, "tip")
     >>> arm(R, p, seed=q[arm.columns]).met
     """

@@ -89,6 +89,7 @@ def _newton(problem: Problem, q: Array, rows: Wish, wish: Wish | None, iteration
     `wish` counts as Gauss and Newton have it.
     """
     space, columns = problem.space, np.flatnonzero(problem.moved)
+    open_space = Space(problem.model, limits=False)  # a derivative wants both sides, also at limits
     x, shift = space.clip(q[None]), 1e-6
     w, k = rows(x), None if wish is None else wish(x)
     cost = _value(w, k)
@@ -98,7 +99,7 @@ def _newton(problem: Problem, q: Array, rows: Wish, wish: Wish | None, iteration
         free = columns[mask[0][columns]]
         if not len(free) or np.abs(g[free]).max() < 1e-14:
             break
-        H = _hessian(problem, rows, x[0], free)
+        H = _hessian(open_space, rows, x[0], free)
         if k is not None:
             H = H + k.J[0][:, free].T @ k.J[0][:, free]
         P = _unblocked(problem, x, g)[np.ix_(free, free)]
@@ -140,13 +141,12 @@ def _square(r: Array) -> Array:
     return np.asarray(np.sum(r * r, axis=1))
 
 
-def _hessian(problem: Problem, rows: Callable[[Array], Rows], q: Array, free: NDArray[np.intp]) -> Array:
+def _hessian(space: Space, rows: Callable[[Array], Rows], q: Array, free: NDArray[np.intp]) -> Array:
     """Second derivative (k, k) of half the cost of rows along the freedoms `free`."""
     h, k = 1e-5, len(free)
-    d = np.zeros((2 * k, problem.space.nv))
+    d = np.zeros((2 * k, space.nv))
     d[np.arange(k), free], d[np.arange(k, 2 * k), free] = h, -h
-    # a derivative wants both sides, also at limits
-    w = rows(Space(problem.model, limits=False).step(np.tile(q, (len(d), 1)), d))
+    w = rows(space.step(np.tile(q, (len(d), 1)), d))
     g = (w.r[:, None, :] @ w.J)[:, 0][:, free]
     H = (g[:k] - g[k:]) / (2 * h)
     return np.asarray(0.5 * (H + H.T))
