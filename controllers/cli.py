@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -144,7 +145,7 @@ def _failures(result: Any, most: int = 8) -> list[str]:
 
 
 def _columns(*heads: str) -> Table:
-    table = Table()
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for head in heads:
         if head in ("law", "joint"):
             table.add_column(head, overflow="fold")

@@ -239,4 +239,4 @@ def _arrival(
     if len(outside) and outside[-1] + 1 < len(left):
         settling = float(t[rest + outside[-1] + 1] - t[rest])
     beyond = -left * np.sign(start)
-    return settling, float(np.max(beyond / scale, initial=0.0))
+    return settling, max(0.0, float(np.max(beyond / scale)))
