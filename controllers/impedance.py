@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from ..sim.control import Target
 from .gains import positive
-from .nominal import Nominal, difference
-from .operational_space import Projection
-from .task import Axes, Task
+from .task import Axes
+from .task_space import TaskSpace
 
 Array = NDArray[np.float64]
 
@@ -24,7 +23,8 @@ class Impedance:
     """The site ``site`` on a spring of ``stiffness`` [N/m] and ``turning`` [N m/rad] around its keyed path.
 
     The damper gives every direction the damping ratio ``damping`` for the inertia felt there. Joints that are
-    left follow the keys at ``posture`` [Hz] without disturbing the site.
+    left follow the keys at ``posture`` [Hz] without disturbing the site. It moves by the joints ``tracked``
+    (nv,) alone; passive ones move as these make them, joints ``keyed`` (nv,) as their keys say.
     """
 
     def __init__(
@@ -32,6 +32,7 @@ class Impedance:
         model: mujoco.MjModel,
         tracked: NDArray[np.bool_],
         q0: Array,
+        keyed: NDArray[np.bool_] | None = None,
         *,
         site: str = "",
         axes: Axes = "position",
@@ -42,30 +43,19 @@ class Impedance:
     ) -> None:
         name = "the impedance law's"
         self.damping = positive(f"{name} damping", damping)
-        self.posture = 2.0 * np.pi * positive(f"{name} posture", posture)
-        self.model, self.tracked = model, tracked
-        self.task, self.nominal = Task(model, site, axes), Nominal(model)
-        self.projection = Projection(self.nominal, tracked)
+        self.space = TaskSpace(model, tracked, keyed, site, axes, posture, name)
         springs = [positive(f"{name} stiffness", stiffness)] * 3 + [positive(f"{name} turning", turning)] * 3
-        self.K = np.diag(springs[: self.task.k])
+        self.K = np.diag(springs[: self.space.task.k])
 
     def start(self) -> None:
         """No memory."""
 
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
-        wanted, now = self.task.at(target.q, target.v), self.task.at(q, v)
-        J = np.where(self.tracked, now.J, 0.0)
-        weight, null, inertia = self.projection.at(q, J)
-        damper = 2.0 * self.damping * double_diagonal(weight, self.K)
-        given = now.J @ np.where(self.tracked, 0.0, target.a)  # by joints that move as keyed
-        force = weight @ (wanted.J @ target.a - given + wanted.drift - now.drift)
-        force += self.K @ self.task.error(now, wanted) + damper @ (wanted.velocity - now.velocity)
-        rest = self.posture**2 * difference(self.model, q, target.q)
-        rest += 2.0 * self.posture * (target.v - v) + target.a
-        tau = J.T @ force + null.T @ (inertia @ np.where(self.tracked, rest, 0.0))
-        tau += self.nominal.inverse(q, v, np.zeros_like(v))
-        return np.where(self.tracked, tau, 0.0), None
+        at = self.space.at(q, v, target)
+        damper = 2.0 * self.damping * double_diagonal(at.inertia, self.K)
+        force = at.inertia @ at.feed + self.K @ at.error + damper @ at.rate
+        return self.space.forces(at, force), None
 
 
 def double_diagonal(inertia: Array, stiffness: Array) -> Array:
