@@ -115,6 +115,8 @@ def check_motion(
     """Hold a motion against every limit of joints and servos; torque is left out without `loads`."""
     t = motion.dense()
     q, v = motion.at(t)
+    if (beyond := mapping.beyond(q)).any():
+        return _out_of_reach(mapping, t, q, beyond, joints)
     s = mapping.servo(q)
     servo_v, _ = mapping.rates(q, v, np.zeros_like(v))
     servo_v_knots, servo_a = mapping.rates(motion.q, motion.v, motion.a)
@@ -152,6 +154,20 @@ def check_motion(
     return Verdict(tuple(verdicts), notes)
 
 
+def _out_of_reach(
+    mapping: Mapping, t: Array, q: Array, beyond: NDArray[np.bool_], joints: JointBounds
+) -> Verdict:
+    """Of a motion that takes joints where their transmissions do not reach: servos have no angles there."""
+    verdicts = []
+    for j in np.flatnonzero(beyond.any(axis=0)):
+        k, name = int(np.argmax(beyond[:, j])), mapping.joints[j]
+        value, ends = q[k, j], (joints.low[j], joints.high[j])
+        limit = min(ends, key=lambda end: abs(end - value))
+        where = (value, limit, mapping.units[j], np.inf, float(t[k]), np.inf)
+        verdicts.append(JointVerdict(name, (Check("position", f"joint {name}", *where),)))
+    return Verdict(tuple(verdicts), ("nothing else was judged: a transmission does not reach there",))
+
+
 def fit(motion: Motion, verdict: Verdict, *, slow: bool) -> Motion:
     """The motion as it is when it fits, slowed to fit when asked; else MotionRefused with the verdict."""
     if verdict.ok:
@@ -174,7 +190,6 @@ def _position(
     out = []
     for i, name in enumerate(names):
         beyond = np.maximum(q[:, i] - high[i], low[i] - q[:, i])
-        beyond = np.where(np.isnan(q[:, i]), np.inf, beyond)  # where a transmission does not reach
         k = int(np.argmax(beyond))
         half = (high[i] - low[i]) / 2
         slack = _ROUNDING if who == "servo" else 1e-3 * half if np.isfinite(half) else 0.0

@@ -139,6 +139,10 @@ class Mapping:
             return q @ self.matrix.T + self.zero
         return self._angles(q)[0] @ self.matrix.T + self.zero
 
+    def beyond(self, q: Array) -> NDArray[np.bool_]:
+        """Where joint values (..., nj) are out of reach of their transmissions: `servo` gives NaN there."""
+        return np.isnan(self._angles(q)[0])
+
     def rates(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         """Servo velocities and accelerations (..., ns) of a joint motion (..., nj)."""
         _, d1, d2 = self._angles(q)

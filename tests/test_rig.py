@@ -428,3 +428,18 @@ def test_any_value_in_any_place_is_told_or_accepted_but_never_a_crash(data: st.D
         return
     if not mistakes:
         make_mapping(rig)  # what has no mistake can be used
+
+
+def test_a_joint_where_its_crank_does_not_reach_is_named_alone() -> None:
+    """A gripper left at 0 m, where no crank angle puts it, says nothing about the other joints."""
+    rig = parse_rig(EVERYTHING)
+    mapping = make_mapping(rig)
+    j = next(i for i, item in enumerate(rig.joints) if item.crank)
+    q = np.tile(joints_inside(np.random.default_rng(0), 1), (3, 1))
+    q[:, j] = 0.0
+    motion = Motion(np.linspace(0, 1, 3), q, np.zeros_like(q), np.zeros_like(q))
+    verdict = check_motion(motion, mapping, make_bounds(rig), joint_bounds(rig))
+    assert [v.joint for v in verdict.joints if not v.ok] == [mapping.joints[j]]
+    assert f"position of joint {mapping.joints[j]}: 0 m" in str(verdict)
+    assert "nan" not in str(verdict)
+    assert np.isinf(verdict.slowdown)
