@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .compose import make_controls, make_engine
+from .engines.common import Broken
 from .engines.contact import INTEGRATORS
 from .engines.interface import Role
 from .engines.touch import can_touch
@@ -26,6 +27,8 @@ from .work_precision import TOLERANCES, Case, Motion, Reference, sure_until, tra
 FRAMES = 50
 TIGHT = 1e-12
 """Tolerance of the smooth engine's reference."""
+LONGEST = 0.1
+"""Longest step that is tried [s]."""
 FINEST = {"smooth": "dop853", "contact": "rk4"}
 """The method of each engine's reference."""
 
@@ -51,11 +54,13 @@ class SceneWork:
         return 4 if self.method == "rk4" and not constraints_of(self.case.model) else 1
 
     def settings(self) -> Iterable[float]:
-        """The controller's period, or a frame's time, and its halves; or tolerances."""
+        """The controller's period, or a frame's time, and its halves below `LONGEST`; or tolerances."""
         if self.knob == "tolerance":
             return TOLERANCES
-        longest = self.plan.period or self.case.duration / self.case.frames
-        return [longest / 2**k for k in range(12)]
+        step = self.plan.period or self.case.duration / self.case.frames
+        while step > LONGEST:
+            step /= 2
+        return [step / 2**k for k in range(12)]
 
     def run(self, setting: float) -> Motion:
         """The motion of the scene in steps of `setting` [s], or to that tolerance."""
@@ -73,14 +78,17 @@ class SceneWork:
         )
         controls = make_controls(plan.setup.scene, problem, plan.period)
         engine = make_engine(self.engine)
-        segment = engine.run(problem, (0.0, case.duration), controls)
+        try:
+            segment = engine.run(problem, (0.0, case.duration), controls)
+        except Broken as broken:  # at this setting
+            segment = broken.segment
         q, v = (
             np.full((case.frames + 1, case.model.nq), np.nan),
             np.full((case.frames + 1, case.model.nv), np.nan),
         )
         n = min(len(segment.t), case.frames + 1)
         q[:n], v[:n] = segment.q[:n], segment.v[:n]
-        return Motion(q, v, int(segment.stats["evaluations"]))
+        return Motion(q, v, int(segment.stats.get("evaluations", 0)))
 
 
 def scene_case(plan: Plan) -> Case:

@@ -278,6 +278,29 @@ def test_report_on_a_scene_with_a_controller(tmp_path):
     assert any("physics of the two engines" in note for note in result.notes)
 
 
+LIMITED = """
+duration = 120
+[[models]]
+file = "cart_pole"
+[initial.position]
+hinge = 2.0
+[physics]
+contacts = "none"
+"""
+
+
+def test_a_setting_at_which_an_engine_breaks_is_a_run_that_diverged(tmp_path):
+    """Steps of a long scene's frames are no steps for its rail: neither the first to be tried, nor fatal."""
+    (tmp_path / "long.toml").write_text(LIMITED)
+    plan = make_plan(load_scene(tmp_path / "long.toml"))
+    case = scene_case(plan)
+    found, notes = scene_runners(plan, case)
+    assert not notes and {runner.engine for runner in found} == {"smooth", "contact"}
+    assert all(max(runner.settings()) <= 0.1 for runner in found)
+    euler = next(runner for runner in found if (runner.engine, runner.method) == ("smooth", "euler"))
+    assert not euler.run(2.4).finite
+
+
 def test_unknown_engines_are_named():
     with pytest.raises(EngineError, match="did you mean 'mujoco'"):
         report(swing(), engines=("mujoko",))
