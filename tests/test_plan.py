@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pantograph.sim import Scene, SceneError, make_plan, run
 from pantograph.sim.engines.interface import Drive, Role
 from pantograph.sim.engines.smooth import width_of
+from pantograph.sim.engines.stiffness import Look, fastest_rate, friction_width
 from pantograph.sim.engines.touch import can_touch
 from pantograph.sim.gain import gain_without_contacts
 from pantograph.sim.needs import Needs
@@ -154,6 +155,42 @@ def test_the_fastest_rate_is_that_of_the_stiffest_spring_damper_or_servo(tmp_pat
     assert rate("", servo, roles={"tracked": ["x"]}) == pytest.approx(15)
     keyed = [{"joint": "x", "times": [0], "values": [0]}]
     assert rate('stiffness="400"', keys=keyed) == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 7, 60]))
+@settings(max_examples=12)
+def test_the_fastest_of_many_oscillators_is_found(seed, n):
+    """Roots of m s^2 + c s + k, in closed form; a keyed one does not count."""
+    rng, spec = np.random.default_rng(seed), mujoco.MjSpec()
+    m, k, c = (10.0 ** rng.uniform(low, high, n + 1) for low, high in ((-1, 1), (0, 4), (-2, 2)))
+    for i in range(n + 1):
+        body = spec.worldbody.add_body()
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, stiffness=[k[i], 0, 0], damping=[c[i], 0, 0])
+        body.add_geom(size=[0.1, 0, 0], mass=m[i])
+    model, moving = spec.compile(), np.arange(n + 1) > 0
+    look = Look(rng.normal(size=n + 1), rng.normal(size=n + 1), np.zeros(0))
+    exact = max(np.abs(np.roots([m[i], c[i], k[i]])).max() for i in range(1, n + 1))
+    assert fastest_rate(model, [look], moving) == pytest.approx(exact, rel=5e-3)
+
+
+CART = """<mujoco><worldbody><body><joint name="cart" type="slide" axis="1 0 0" frictionloss="{f}"/>
+<geom size=".1" mass="1"/><body><joint name="pole" axis="0 1 0" frictionloss="2"/>
+<geom size=".1" mass="3" pos="0 0 -.5"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("cart_keyed", [True, False])
+def test_the_width_of_friction_is_that_of_what_moves(cart_keyed):
+    """A pole of inertia J and moment h = 1.5 kg m: 1/J with the cart held, else 1/(J - h^2/M)."""
+    model = mujoco.MjModel.from_xml_string(CART.format(f=0))
+    J = 3 * (0.5**2 + 0.4 * 0.1**2)
+    mobility = 1 / J if cart_keyed else 1 / (J - 1.5**2 / 4)
+    moving = np.array([not cart_keyed, True])
+    assert friction_width(model, np.zeros(2), moving, 0.02) == pytest.approx(2 * mobility * 0.02, rel=1e-6)
+    # dry as well, the cart counts where it moves: the larger root of both together
+    model = mujoco.MjModel.from_xml_string(CART.format(f=5))
+    M, F = np.array([[4, -1.5], [-1.5, J]]), np.diag([5.0, 2.0])
+    rate = 2 / J if cart_keyed else np.linalg.eigvals(np.linalg.solve(M, F)).max()
+    assert friction_width(model, np.zeros(2), moving, 0.02) == pytest.approx(rate * 0.02, rel=1e-6)
 
 
 STIFF = ("joint", "cubic", "damper", "tendon", "tendon damper", "servo", "tendon servo")
