@@ -26,21 +26,25 @@ _PARTS = 16  # stretches of added force on the way to the goal
 _SAMPLES, _ROUNDS, _BRANCHES = 64, 5, 3  # of the cross-entropy method; gains it starts from
 _ARRIVED = 1e12  # that arrivals are better than any value
 _CATCHING = 2.0  # seconds that a corrected motion has after its nearest point to be caught
+_ALONE = 1.0  # seconds at least without the catch for machines that it would lose
 _WELL_IN = 0.1  # of the catch's level: a machine that it has brought there is home
 
 
 class Intent(NamedTuple):
     """What a batch of machines (b,) is about to do: gains by their index; forces added to theirs in equal
-    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided (b,) [ticks]."""
+    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided (b,) [ticks]; and
+    whether the catch waits until these forces are through (b,)."""
 
     choice: NDArray[np.intp]
     extra: Array
     stretch: Array
     begun: Array
+    alone: Mask
 
     def of(self, rows: NDArray[np.intp] | Mask) -> Intent:
         """Those of some machines, as arrays of their own."""
-        return Intent(self.choice[rows], self.extra[rows], self.stretch[rows], self.begun[rows])
+        first = (self.choice[rows], self.extra[rows], self.stretch[rows])
+        return Intent(*first, self.begun[rows], self.alone[rows])
 
     def put(self, rows: NDArray[np.intp] | Mask, other: Intent) -> None:
         """Overwrite those of some machines."""
@@ -103,6 +107,7 @@ class SwingUp:
         pump = self.shaping.push(q, v, x[:, self.a], self.shaping.gains[intent.choice])
         part = ((tick - intent.begun) // intent.stretch).astype(np.intp)
         planned = part < intent.extra.shape[1]
+        caught &= ~(intent.alone & planned)
         rows = np.arange(len(q))
         pump[:, self.a] += np.where(planned, intent.extra[rows, np.where(planned, part, 0)], 0.0)
         tau = np.where(caught[:, None], catch.force(x), pump)
@@ -160,22 +165,32 @@ class SwingUp:
         if len(lost):
             near = np.argsort(least[: b * k].reshape(b, k)[lost], axis=1)[:, :_BRANCHES]
             when = np.take_along_axis(when[: b * k].reshape(b, k)[lost], near, axis=1)
-            out.put(lost, self._corrected(q[lost], v[lost], near, when, tick))
+            out.put(lost, self._corrected(q[lost], v[lost], near, when, tick, self._held(q[lost], v[lost])))
         return out
 
     def _plain(self, choice: NDArray[np.intp], tick: int) -> Intent:
         b = len(choice)
-        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)))
+        none = np.zeros(b, dtype=bool)
+        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)), none)
 
-    def _corrected(self, q: Array, v: Array, choice: NDArray[np.intp], when: Array, tick: int) -> Intent:
+    def _held(self, q: Array, v: Array) -> Mask:
+        """Whether the catch would have machines (b,) now."""
+        catch, level = self.shaping.catch
+        return np.asarray(catch.value(catch.state(q, v)) < level)
+
+    def _corrected(
+        self, q: Array, v: Array, choice: NDArray[np.intp], when: Array, tick: int, held: Mask
+    ) -> Intent:
         """Intentions of machines (b,) with added forces that arrive first, or come nearest to the goal, about
-        several gains ``choice`` (b, c) each, which came nearest after ``when`` (b, c) ticks."""
+        several gains ``choice`` (b, c) each, which came nearest after ``when`` (b, c) ticks. From those that
+        it would lose although it has them already, ``held`` (b,), the catch keeps its hands for a while."""
         rng, (b, c), p = np.random.default_rng(self.seed), choice.shape, _SAMPLES
         limit, rows = min(-self.low[self.a], self.high[self.a]), np.arange(b * c)
+        when = np.where(held[:, None], np.maximum(when, _ALONE / self.period), when)
         stretch = np.maximum(1.0, np.ceil((when.ravel() + 1.0) / _PARTS))
         until = np.repeat(when.ravel(), p) + _CATCHING / self.period
         mean, spread = np.zeros((b * c, _PARTS)), np.full((b * c, _PARTS), 0.6 * limit)
-        best = self._plain(choice.ravel(), tick)._replace(stretch=stretch)
+        best = self._plain(choice.ravel(), tick)._replace(stretch=stretch, alone=np.repeat(held, c))
         score, machine, sample = np.full(b * c, np.inf), np.repeat(np.arange(b), c * p), np.repeat(rows, p)
         for _ in range(_ROUNDS):
             noise = np.tile(rng.normal(size=(c, p, _PARTS)), (b, 1, 1))  # the same for every machine

@@ -1,5 +1,6 @@
 """Swing-up: what energy shaping promises, what the catch holds, and arrivals in the engines."""
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -138,6 +139,25 @@ def test_weak_carts_stand_up_from_anywhere():
         if tick > 1000:
             assert np.abs(law.shaping.catch[0].state(q, v)[:, 1]).max() < 0.2
     assert worst < 1.0
+
+
+def test_what_the_catch_would_drive_off_the_rail_it_gets_later():
+    """A heavy pole beside upright on a quick cart: within the catch's level, and with too little rail."""
+    model = load_model("cart_pole")
+    model.body_mass[-1], model.body_inertia[-1] = 2 * model.body_mass[-1], 2 * model.body_inertia[-1]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    limit = 0.5 * 9.81 * model.body_mass.sum()
+    model.actuator_ctrlrange[0] = [-limit, limit]
+    law = SwingUp(model, np.array([True, False]), model.qpos0, 0.01)
+    q, v = np.array([[0.0, 0.33589284]]), np.array([[0.87835992, 0.68605013]])
+    catch, level = law.shaping.catch
+    assert catch.value(catch.state(q, v))[0] < level
+    memory = law.begin(1)
+    for _ in range(500):
+        tau, memory = law.batch(q, v, memory)
+        q, v = advance(law.nominal, q, v, tau, 0.001, 10)
+        assert abs(q[0, 0]) < 1.0
+    assert np.abs(catch.state(q, v)).max() < 0.05
 
 
 def test_one_machine_does_what_it_does_in_a_batch():
