@@ -61,15 +61,17 @@ class Report:
 
     Attributes:
         name: of the case.
-        rows: the table; `Row.error` in rad and m for a motion, in units of the case's scale for a hard case.
+        rows: the table.
         yardsticks: what errors are measured against.
         notes: what was left out, and why.
+        measure: what `Row.error` and `Row.estimate` are, in words.
     """
 
     name: str
     rows: tuple[Row, ...]
     yardsticks: tuple[Yardstick, ...]
     notes: tuple[str, ...] = ()
+    measure: str = "global error [rad, m]"
 
     def uncertainty(self, engine: str) -> float:
         """Error of the reference that an engine's rows are measured against."""
@@ -127,7 +129,8 @@ class Report:
         """Error against processor time and against evaluations, a line for each method."""
         from .report_figure import draw
 
-        return draw(self.name, by_method(self.rows), [y.uncertainty for y in self.yardsticks])
+        unsure = [(y.engine, y.uncertainty) for y in self.yardsticks]
+        return draw(self.name, self.measure, by_method(self.rows), unsure)
 
     def write(self, folder: str | Path) -> Path:
         """Write table.csv, report.json, report.txt and report.png into `folder`, made when missing."""
@@ -140,6 +143,7 @@ class Report:
         finite = [{k: _json(v) for k, v in row.items()} for row in self.table()]
         content = {
             "name": self.name,
+            "measure": self.measure,
             "references": [{k: _json(v) for k, v in asdict(y).items()} for y in self.yardsticks],
             "notes": list(self.notes),
             "recommendation": self.recommendation().splitlines(),
@@ -162,7 +166,7 @@ class Report:
         return self._text(best)
 
     def _text(self, rows: Sequence[Row]) -> str:
-        lines = [self.name]
+        lines = [self.name, f"Error: {self.measure}; estimate: of it, from the same method's next finer run."]
         lines += [f"Reference: {y.source}; its own error about {y.uncertainty:.1e}." for y in self.yardsticks]
         lines += [f"Note: {note}." for note in self.notes]
         if len(rows) < len(self.rows):
@@ -273,7 +277,8 @@ def _of_case(
     for runner in runners(case, smooth, engines):
         _tell(progress, runner)
         rows += sweep(runner, error, apart, floor=yardstick.uncertainty, budget_s=budget_s)
-    return Report(case.name, tuple(rows), (yardstick,), notes)
+    words = {} if hard is None else {"measure": f"error of {hard.observe} at the end, of its scale"}
+    return Report(case.name, tuple(rows), (yardstick,), notes, **words)
 
 
 def _case(subject: Case | HardCase | mujoco.MjModel) -> Case:

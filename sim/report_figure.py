@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from .work_precision import Row
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _SHADES = {"smooth": "Blues", "mujoco": "Reds", "contact": "Reds", "scipy": "Greens", "torch": "Purples"}
@@ -16,8 +17,16 @@ _MARKERS = "osv^<>DPX*dph"
 _FLOOR, _CEILING = 1e-17, 1e2  # errors beyond are not drawn
 
 
-def draw(name: str, methods: Mapping[tuple[str, str, str], Sequence[Row]], unsure: Sequence[float]) -> Figure:
-    """Error over processor time and over evaluations, a line for each (engine, method, knob)."""
+def draw(
+    name: str,
+    measure: str,
+    methods: Mapping[tuple[str, str, str], Sequence[Row]],
+    unsure: Sequence[tuple[str, float]],
+) -> Figure:
+    """Error over processor time and over evaluations, a line for each (engine, method, knob).
+
+    `measure` says what an error is; `unsure` are the references' own errors with their engine ("": all).
+    """
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
@@ -38,16 +47,32 @@ def draw(name: str, methods: Mapping[tuple[str, str, str], Sequence[Row]], unsur
         axes[0].loglog([1e3 * row.cpu_s for row in seen], [row.error for row in seen], label=label, **style)
         axes[1].loglog([row.evaluations for row in seen], [row.error for row in seen], **style)
     for ax, what in zip(axes, ("processor time [ms]", "evaluations of the equations of motion"), strict=True):
-        ax.axhspan(_FLOOR, max([_FLOOR, *unsure]), color="0.93", zorder=0)
+        for engine, error in unsure:
+            color = colormaps[_SHADES[engine]](0.7) if engine else "0.5"
+            ax.axhspan(_FLOOR, max(_FLOOR, error), color=color, alpha=0.12, linewidth=0, zorder=0)
         ax.set_xlabel(what)
+        _ticks(ax)
         ax.grid(alpha=0.3)
     shown = [row.error for rows in methods.values() for row in rows if 0 < row.error < math.inf]
-    shown = [x for x in [*shown, *unsure] if x > _FLOOR] or [1e-3]
+    shown = [x for x in [*shown, *(error for _, error in unsure)] if x > _FLOOR] or [1e-3]
     axes[0].set_ylim(min(shown) / 3, min(max(shown) * 3, _CEILING))
-    axes[0].set_ylabel("global error [rad, m]; grey: the reference's own")
+    axes[0].set_ylabel(f"{measure}; shaded: the reference's own")
     figure.suptitle(name)
     if methods:
         figure.legend(loc="outside right upper", fontsize=7)
     else:
-        axes[0].text(0.5, 0.5, "nothing is integrated", ha="center", transform=axes[0].transAxes)
+        for ax in axes:
+            ax.set_axis_off()
+        figure.text(0.5, 0.5, "nothing is integrated", ha="center")
     return figure
+
+
+def _ticks(ax: Axes) -> None:
+    """Numbers along a logarithmic axis that do not run into each other, also over less than a decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = ax.get_xlim()
+    if low > 0 and high < 50 * low:
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
