@@ -114,8 +114,7 @@ def _manipulability(problem: Problem) -> Wish:
     """
     h, columns = 1e-6, np.flatnonzero(problem.moved)
     space, free = problem.space, Space(problem.model, limits=False)
-    some = space.random(np.random.default_rng(0), 8, space.clip(problem.model.qpos0[None])[0], problem.moved)
-    rank = int(np.linalg.matrix_rank(problem.weighted(problem.raw(some)).J, tol=1e-9).max())
+    rank = problem.rank(space.clip(problem.model.qpos0[None])[0])
 
     def inverse(q: Array) -> Array:
         J = problem.weighted(problem.raw(q)).J

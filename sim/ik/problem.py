@@ -151,6 +151,11 @@ class Problem:
         fine = (np.abs(r) <= self.tolerance) | ~self.judged
         return np.asarray(fine.all(axis=1) & np.isfinite(r).all(axis=1))
 
+    def rank(self, start: Array) -> int:
+        """How many independent rows there are but at singular configurations; the rest stands as `start`."""
+        q = self.space.random(np.random.default_rng(0), 8, start, self.moved)
+        return int(np.linalg.matrix_rank(self.weighted(self.raw(q)).J, tol=1e-9).max())
+
     def only(self, goals: Sequence[Goal]) -> Problem:
         """The same model and freedoms with other goals."""
         out = Problem(self.model, goals, self.space, kinematics=self.kinematics, code=self.code)

@@ -75,7 +75,8 @@ def solve(
     search = Search(judged, start, restarts=restarts, seed=(seed,), hopeless=lambda: excluded(judged, start))
     form = closed_form(judged, start)
     found = search.solutions(np.zeros((0, judged.space.nq)) if form is None else form.q)
-    if len(found) and (all or not near or not search.direct):  # what is best may lie elsewhere
+    complete = all and len(found) > 0 and _listed(judged, form, found)
+    if len(found) and not complete and (all or not near or not search.direct):  # the best may lie elsewhere
         found = np.concatenate([found, search.more(restarts if all else 40)])
     if not len(found):
         nearest = brought(search)
@@ -83,7 +84,6 @@ def solve(
         found = reason.found
     if len(found):
         best = _settled(judged, found, wish, start, every=all, near=near)
-        complete = all and _listed(judged, form, best)
         words = _solved_words(judged, best) + (_listed_words(judged, best, complete) if all else "")
         verdict = Verdict("solved", True, words + closest(model, obstacles, best[0]))
         answer = _Answer(best[0], verdict, best if all else best[:1], complete)
@@ -117,7 +117,8 @@ def _listed(problem: Problem, form: ClosedForm | None, found: Array) -> bool:
     if form is None or not form.complete or (problem.band > 0).any():
         return False
     q = problem.space.clip(form.q[problem.space.excess(form.q).max(axis=1, initial=0.0) <= AT_LIMIT])
-    return len(distinct(problem.space, q[problem.met(problem.raw(q).r)])) <= len(found)
+    here = len(distinct(problem.space, q[problem.met(problem.raw(q).r)]))
+    return here == len(distinct(problem.space, found))
 
 
 def _listed_words(problem: Problem, found: Array, complete: bool) -> str:
@@ -125,11 +126,10 @@ def _listed_words(problem: Problem, found: Array, complete: bool) -> str:
     count = f"{len(found)} solution{'s' * (len(found) > 1)}"
     if complete:
         return f"; {count}, all there are but for whole turns, by a closed form"
-    J = problem.weighted(problem.raw(found[:1])).J[0][problem.judged]
-    free = int(problem.moved.sum()) - np.linalg.matrix_rank(J[:, problem.moved], tol=1e-7)
+    free = int(problem.moved.sum()) - problem.rank(found[0])
     if free > 0:
         left = "1 freedom is" if free == 1 else f"{free} freedoms are"
-        return f"; {left} left, of the continuum of solutions {count} where restarts ended are listed"
+        return f"; {left} left, {count} of a continuum where restarts ended"
     return f"; {count} found, not proved to be all"
 
 

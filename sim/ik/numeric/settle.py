@@ -84,9 +84,12 @@ def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: 
     `wish` are their rows, those of nearness `faint` times the distance. In machine code where the problem has
     some, and where that has come to rest at what meets the goals and serves the wishes better than q.
     """
-    quick = problem.prepared(build=True)
-    if quick is None or not quick.machine.layout.along:
-        return [settle(problem, x, wish) for x in q]
+    slow: list[Settled] = []
+    while (quick := problem.prepared(build=True)) is None or not quick.machine.layout.along:
+        if len(slow) == len(q):
+            return slow
+        slow.append(settle(problem, q[len(slow)], wish))
+    q = q[len(slow) :]
     machine = quick.machine
     first = worth(problem, q, start, faint)
     far = machine.settle(q, machine.arguments(problem, q0=start, s=faint**2))
@@ -97,7 +100,7 @@ def settle_near(problem: Problem, q: Array, start: Array, wish: Wish, *, faint: 
         x = descend(problem, far.q, iterations=8).q
         value = worth(problem, x, start, faint)
     fine &= problem.met(problem.raw(x).r)
-    return [
+    return slow + [
         Settled(x[i], float(value[i]), int(far.iterations[i])) if fine[i] else settle(problem, q[i], wish)
         for i in range(len(q))
     ]
