@@ -35,7 +35,7 @@ def examine(
     in between.
     """
     pieces, part = len(t) - 1, np.linspace(0.0, 1.0, _FINER + 1)
-    trace = follow(clip, t, _FINER)
+    trace = follow(clip, t, _FINER, jerk=machine.asks_jerk)
     motion = trace.motion
     need = forces(motion, machine)
     largest = max(float(np.abs(need).max()), 1e-12)

@@ -78,11 +78,11 @@ class Report:
 
 class Trace(NamedTuple):
     """Rows of motion along pieces of a clip, the last of each from the left: t (n,) [s], q, v, a, and
-    ``jerk`` (n, nv), infinite where accelerations jump."""
+    ``jerk`` (n, nv), infinite where accelerations jump, or None."""
 
     t: Array
     motion: Motion
-    jerk: Array
+    jerk: Array | None
 
 
 def check(clip: Clip, machine: Machine, *, phases: Sequence[Phase] = (), points: int = 2000) -> Report:
@@ -95,14 +95,15 @@ def check(clip: Clip, machine: Machine, *, phases: Sequence[Phase] = (), points:
     grid = np.linspace(clip.start, clip.end, max(points // part, 1) + 1)
     nodes = np.union1d(grid, knots(clip))
     nodes = nodes[np.append(True, np.diff(nodes) > 1e-12 * max(1.0, abs(nodes[-1])))]
-    trace = follow(clip, nodes if len(nodes) > 1 else np.repeat(nodes, 2), part)
+    nodes = nodes if len(nodes) > 1 else np.repeat(nodes, 2)
+    trace = follow(clip, nodes, part, jerk=machine.asks_jerk)
     need = forces(trace.motion, machine)
     loose = np.flatnonzero(~machine.driven & clip.dofs)
     need, _ = missing(machine.model, phases, trace.t, trace.motion.q, need, loose)
     return report(trace, machine, keyed=clip.dofs, need=need)
 
 
-def follow(clip: Clip, nodes: Array, parts: int = 10) -> Trace:
+def follow(clip: Clip, nodes: Array, parts: int = 10, *, jerk: bool = True) -> Trace:
     """Motion at ``parts`` + 1 points on each piece between times ``nodes`` (n + 1,) of a clip.
 
     Knots of the clip are to be among the nodes: jerk follows from accelerations at four points of a piece
@@ -114,6 +115,14 @@ def follow(clip: Clip, nodes: Array, parts: int = 10) -> Trace:
     fine[:, -1] = nodes[1:]
     right, left = clip.evaluate(fine[:, :-1]), clip.evaluate(fine[:, -1:], left=True)
     q, v, a = (np.concatenate(pair, axis=1) for pair in zip(right, left, strict=True))
+    rows = Motion(*(x.reshape(-1, x.shape[-1]) for x in (q, v, a)))
+    size = np.abs(_jerk(clip, nodes, v, a)).reshape(rows.a.shape) if jerk else None
+    return Trace(fine.ravel(), rows, size)
+
+
+def _jerk(clip: Clip, nodes: Array, v: Array, a: Array) -> Array:
+    """Jerk (n, parts + 1, nv) on pieces between nodes (n + 1,) from velocities and accelerations."""
+    h, parts = np.diff(nodes), a.shape[1] - 1
     jerk = np.einsum("ij,pjd->pid", _slopes(parts), a) / np.maximum(h, 1e-300)[:, None, None]
     real = 1e-9 * (1.0 + np.abs(a).max(initial=0.0))
     jumps = np.abs(a[1:, 0] - a[:-1, -1]) > real
@@ -125,8 +134,7 @@ def follow(clip: Clip, nodes: Array, parts: int = 10) -> Trace:
     still = 1e-9 * (1.0 + np.abs(v).max(initial=0.0))
     for at in ((0, 0), (-1, -1)):  # out of rest, and into it
         jerk[at][(np.abs(v[at]) <= still) & (np.abs(a[at]) > real)] = np.inf
-    rows = Motion(*(x.reshape(-1, x.shape[-1]) for x in (q, v, a)))
-    return Trace(fine.ravel(), rows, np.abs(jerk).reshape(rows.a.shape))
+    return np.asarray(jerk)
 
 
 def _near(t: Array, breaks: Array) -> NDArray[np.bool_]:
@@ -210,7 +218,7 @@ def shares(
             ("jerk", trace.jerk, machine.jerk),
         )
         for kind, values, limits in rates:
-            if np.isfinite(limits[dof]):
+            if np.isfinite(limits[dof]) and values is not None:
                 size = np.abs(values[:, dof])
                 out.append(Use(kind, who, size, float(limits[dof]), size / limits[dof]))
         if need is not None:
@@ -236,7 +244,7 @@ def _pushes(who: str, dof: int, need: Array, v: Array, machine: Machine, keyed: 
 def by_piece(machine: Machine, t: Array, clip: Clip) -> Array:
     """Largest share (n,) of a limit in use on each piece between times t (n + 1,)."""
     out = np.zeros(len(t) - 1)
-    for use in shares(follow(clip, t), machine, keyed=clip.dofs):
+    for use in shares(follow(clip, t, jerk=machine.asks_jerk), machine, keyed=clip.dofs):
         if use.kind != "position":
             out = np.maximum(out, use.share.reshape(len(out), -1).max(axis=1))
     return out

@@ -97,8 +97,9 @@ class Grid:
 
     def corners(self) -> list[Corner]:
         """Where the path has a corner and does not rest as it is."""
-        names, top = dof_names(self.clip.model), 1e-6 * float(self.turn.max(initial=0.0))
         moves = ~(self.still[1:] | self.still[:-1]) & self.cornered
+        names = dof_names(self.clip.model) if moves.any() else ()
+        top = 1e-6 * float(self.turn.max(initial=0.0))
         return [
             Corner(
                 float(self.s[k + 1]),
@@ -213,12 +214,12 @@ def _neighbourly(cap: Array) -> Array:
     """Bounds of x (n + 1,) that hold between nodes, too, where q' rises from nearly nothing.
 
     With q' straight from g to 1 on [0, 1] and x from k to 1, q' sqrt(x) has its largest value at 1 if
-    k <= 3 - 2 g, and g is the root of the bounds' ratio.
+    k <= 3 - 2 g, and g is the root of the bounds' ratio. Where g is not small, smaller pieces do.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = np.sqrt(cap[1:] / cap[:-1])
-    fall = np.where(slope < 1.0, 3.0 - 2.0 * slope, np.inf)
-    rise = np.where(slope > 1.0, 3.0 - 2.0 / slope, np.inf)
+    fall = np.where(slope < 0.6, 3.0 - 2.0 * slope, np.inf)
+    rise = np.where(slope > 1.0 / 0.6, 3.0 - 2.0 / slope, np.inf)
     out = cap.copy()
     for i in range(1, len(out)):
         out[i] = min(out[i], rise[i - 1] * out[i - 1])

@@ -48,6 +48,11 @@ class Machine:
         return bool(limited.any() or not self.driven.all() or np.isfinite(self.current))
 
     @property
+    def asks_jerk(self) -> bool:
+        """Whether any joint has a limit on jerk."""
+        return bool(np.isfinite(self.jerk).any())
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The machine's model, without its actuators."""
         return self.nominal.model

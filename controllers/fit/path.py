@@ -169,21 +169,22 @@ def _zeros(clip: Clip, low: Array, high: Array) -> Array:
 def uneven(clip: Clip, still: list[tuple[float, float]], *, keep: bool) -> bool:
     """Whether the keys rest or change their speed at once on a way that goes on, or ease into a rest more
     than a parabola would: the time of the keys is then no measure of the path."""
-    stops = [c.s for c in corners(clip, np.zeros(clip.model.nv, dtype=bool), still, keep=keep)]
-    whole, breaks = clip.evaluate(np.linspace(clip.start, clip.end, 501)), clip.breaks
-    jump = np.abs(clip.evaluate(breaks).v - clip.evaluate(breaks, left=True).v).max(axis=1, initial=0.0)
-    inner = (breaks > clip.start) & (breaks < clip.end) & (jump > _REST * np.abs(whole.v).max())
-    rests = np.union1d(_rests(clip), breaks[inner])
+    at = knots(clip)
+    left, right = clip.evaluate(at, left=True), clip.evaluate(at)
+    slow, gentle = (_REST * np.abs(right.v).max(), 1e-3 * np.abs(right.a).max())
+    rests = np.maximum(np.abs(left.v), np.abs(right.v)).max(axis=1) <= slow
+    moves = np.ones(len(at), dtype=bool)
     for a, b in still:
-        rests = rests[(rests < a) | (rests > b)]
-    if len(rests) and (np.min(np.abs(rests[:, None] - np.append(stops, np.inf)), axis=1) > 0.0).any():
-        return True
-    ends = np.unique([clip.start, clip.end, *stops])
-    for at in (clip.evaluate(ends[:-1]), clip.evaluate(ends[1:], left=True)):
-        slow = np.abs(at.v).max(axis=1) <= _REST * np.abs(whole.v).max()
-        if (slow & (np.abs(at.a).max(axis=1) <= 1e-3 * np.abs(whole.a).max())).any():
-            return True
-    return False
+        moves &= (at < a) | (at > b)
+    inner = moves & (at > clip.start) & (at < clip.end)
+    through = at[inner & (rests | (np.abs(right.v - left.v).max(axis=1) > slow))]
+    eased = rests & moves & (np.minimum(np.abs(left.a).max(axis=1), np.abs(right.a).max(axis=1)) <= gentle)
+    eased[0] = rests[0] and moves[0] and np.abs(right.a[0]).max() <= gentle
+    eased[-1] = rests[-1] and moves[-1] and np.abs(left.a[-1]).max() <= gentle
+    if eased.any() or not len(through):
+        return bool(eased.any())
+    stops = [c.s for c in corners(clip, np.zeros(clip.model.nv, dtype=bool), still, keep=keep)]
+    return not np.isin(through, stops).all()
 
 
 def _rests(clip: Clip) -> Array:
@@ -242,7 +243,7 @@ def even_nodes(clip: Clip, by: Measure, points: int) -> Array:
     # the shorter a piece, the more rounding of positions is in its accelerations
     short = _lengths(clip, by, nodes) < 1e-5 * p[-1]
     last = np.isin(nodes, fixed)
-    return nodes[last | ~(np.append(short, False) | np.append(False, short))]
+    return np.asarray(nodes[last | ~(np.append(short, False) | np.append(False, short))])
 
 
 def _apart(nodes: Array) -> Array:

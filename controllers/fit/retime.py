@@ -21,6 +21,8 @@ from .smooth import smooth
 
 Array = NDArray[np.float64]
 _ROUNDS, _NEAR = 5, 1.003  # of cutting pieces, until limits hold to this between points
+_POWERS = {"velocity": 1.0, "acceleration": 2.0, "jerk": 3.0}  # of the slowdown by which they fall
+_ENOUGH = 1e-3  # part by which a motion may be slowed too much
 _TIGHT = 5e-7  # part of a limit that may be exceeded
 
 
@@ -40,12 +42,12 @@ class RetimedCurve(Curve):
 
     def _piece(self, i: NDArray[np.intp], s: Array) -> tuple[Array, Array, Array]:
         rate, bend = self.rate[i] + self.bend[i] * s, self.bend[i]
-        # rounding must not carry the end of a piece over a break of the curve below
+        # rounding must not carry the end of a piece over a break of the curve below, nor onto its other side
         at = np.clip(self.s[i] + (self.rate[i] + 0.5 * self.bend[i] * s) * s, self.s[i], self.s[i + 1])
-        q, v, a = self.base(at)
-        last = at >= self.s[i + 1]
-        if last.any():
-            q[last], v[last], a[last] = self.base(at[last], left=True)
+        late = at > 0.5 * (self.s[i] + self.s[i + 1])
+        q, v, a = np.empty((len(at), self.dim)), *np.empty((2, len(at), self.dof))
+        for side, left in ((~late, False), (late, True)):
+            q[side], v[side], a[side] = self.base(at[side], left=left)
         return q, v * rate[:, None], v * bend[:, None] + a * (rate**2)[:, None]
 
 
@@ -106,12 +108,13 @@ def retime(
         return _slowed(at, s, corners, machine)
     for _ in range(_ROUNDS):
         at = _parabolas(grid, x)
-        coarse = by_piece(machine, *at(1.0)) > _NEAR
+        found = _slowed(at, grid.s, grid.corners(), machine)
+        coarse = by_piece(machine, *at(1.0)) > _NEAR if found.slowed > _NEAR else np.zeros(0, dtype=bool)
         if not coarse.any() or len(grid.s) > 8 * points:
             break
         grid = Grid(clip, machine, np.union1d(grid.s, 0.5 * (grid.s[1:] + grid.s[:-1])[coarse]))
         x = grid.fastest(keep, (at_rest, at_rest))
-    return _slowed(_parabolas(grid, x), grid.s, grid.corners(), machine)
+    return found
 
 
 def _parabolas(grid: Grid, x: Array) -> Callable[[float], tuple[Array, Clip]]:
@@ -138,23 +141,23 @@ def _slowed(
     at: Callable[[float], tuple[Array, Clip]], s: Array, corners: list[Corner], machine: Machine
 ) -> Retimed:
     """The clip ``at`` the least slowdown with which it holds on a grid ten times finer."""
-    low, slow, high = 1.0, 1.0, np.inf
+    low, slow, high, exact = 1.0, 1.0, np.inf, False
     for _ in range(40):
         t, clip = at(slow)
-        found = report(follow(clip, t), machine, keyed=clip.dofs)
+        found = report(follow(clip, t, jerk=machine.asks_jerk), machine, keyed=clip.dofs)
         over = [v for v in found.violations if v.kind != "position"]
-        worst = max((v.share for v in over), default=0.0)
-        if worst <= 1.0 + _TIGHT:
-            if slow == 1.0 or slow <= low * (1.0 + 1e-5):
+        if max((v.share for v in over), default=0.0) <= 1.0 + _TIGHT:
+            if exact or slow <= low * (1.0 + _ENOUGH):
                 break
-            high = slow
-        else:
-            low = slow
-        if not np.isfinite(worst) or low > 100.0:
+            high, slow = slow, float(np.sqrt(low * slow))
+            continue
+        low = slow
+        if not np.isfinite(over[0].share) or low > 100.0:
             raise PantographError(f"no timing was found that holds between points of the path: {over[0]}")
-        slow = min(slow * max(map(_slowdown, over)), high) if worst > 1.0 else slow
-        if np.isfinite(high):
-            slow = high if high <= low * (1.0 + 1e-5) else float(np.sqrt(low * high))
+        exact = np.isinf(high) and all(v.kind in _POWERS for v in over)
+        slow = slow * max(map(_slowdown, over)) if np.isinf(high) else float(np.sqrt(low * high))
+        if high <= low * (1.0 + _ENOUGH):
+            slow, exact = high, True
     out_of_range = [v for v in found.violations if v.kind == "position"]
     if out_of_range and out_of_range[0].value > 1e-9:
         raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
@@ -164,5 +167,4 @@ def _slowed(
 
 def _slowdown(v: Violation) -> float:
     """By how much a motion is slowed that exceeds one limit: a force has a part that does not fall at all."""
-    powers = {"velocity": 1.0, "acceleration": 2.0, "jerk": 3.0}
-    return v.share ** (1.0 / powers[v.kind]) if v.kind in powers else 1.0 + 2.0 * (v.share - 1.0)
+    return float(v.share ** (1.0 / _POWERS[v.kind])) if v.kind in _POWERS else 1.0 + 2.0 * (v.share - 1.0)
