@@ -117,7 +117,8 @@ class Report:
                 whose = f" of the {y.engine} engine" if y.engine else ""
                 sentences.append(
                     f"Beyond {y.sure_until:.3g} s the reference{whose} is not sure to {SURE:g}: errors grow "
-                    "fast there (chaos, impacts). Ask for less time, or for statistics over many starts."
+                    "fast there (chaos, impacts), or its steps are too long. Ask for less time, or for "
+                    "statistics over many starts."
                 )
         return sentences
 
