@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 
 _PARTS = 16  # stretches of added force on the way to the goal
 _SAMPLES, _ROUNDS, _BRANCHES = 64, 5, 3  # of the cross-entropy method; gains it starts from
-_ARRIVED = 1e12  # that arrivals are better than any value
+_ARRIVED, _OFF = 1e12, 1e9  # arrivals are better than any value, whatever crosses a limit is worse
 _CATCHING = 2.0  # seconds that a corrected motion has after its nearest point to be caught
 _ALONE = 1.0  # seconds at least without the catch for machines that it would lose
 _WELL_IN = 0.1  # of the catch's level: a machine that it has brought there is home
@@ -124,7 +124,8 @@ class SwingUp:
     ) -> tuple[Array, Array, Array]:
         """What comes ``until`` (b,) ticks later of intentions (b,), several for each ``machine`` (b,): ticks
         until the catch has brought it well into its basin (infinite: another of the machine's is quicker, a
-        limit is crossed, or it does not), the least value on the way, and ticks until then."""
+        limit is crossed, or it does not), the least value on the way (much more where a limit is crossed),
+        and ticks until then."""
         b, (_, level) = len(q), self.shaping.catch
         until = np.broadcast_to(until, b)
         home, least, when = np.full(b, np.inf), np.full(b, np.inf), np.zeros(b)
@@ -137,7 +138,9 @@ class SwingUp:
             arrived = rows[inside & caught & (value < _WELL_IN * level)]
             home[arrived], done[machine[arrived]] = k, True
             q, v = advance(self.nominal, q, v, tau, self.period / 2, 2)
-            inside &= self._inside(q)
+            still = inside & self._inside(q)
+            least[rows[inside & ~still]] += _OFF
+            inside = still
             if k % 10 == 9 or len(arrived):
                 keep = inside & (np.abs(v) < 1e3).all(axis=1) & ~done[machine[rows]] & (k < until[rows])
                 if not keep.any():
