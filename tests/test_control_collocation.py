@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from pantograph.controllers.fit import Phase, check, fit, machine, prove
 from pantograph.controllers.fit.charts import Charts
+from pantograph.controllers.fit.prove import given_by
 from pantograph.controllers.fit.task import task_of
 from pantograph.controllers.nominal import difference, moved
 from pantograph.models import load_model
@@ -269,6 +270,73 @@ def test_a_hopper_with_a_free_base_hops():
         missing = max(missing, np.abs(need - tau).max())
     assert missing < 1e-6 * largest
     assert prove(found, able).worst < 0.1  # under servos, with MuJoCo's contacts
+
+
+@pytest.mark.parametrize(
+    ("values", "limits", "message"),
+    [
+        ([0, 3.5], {}, r"pose at 1 s is 0\.4 rad or m beyond the range of 'shoulder'"),
+        ([0, 1.0], {"velocity": 0.5}, r"'shoulder' moves at 1 rad/s or m/s in the mean, its limit is 0\.5"),
+    ],
+)
+def test_what_no_motion_does_is_told_before_it_is_sought(values, limits, message):
+    seen = []
+    with pytest.raises(PantographError, match=message):
+        fit(move(ARM, "shoulder", [0, 1], values), machine(ARM, **limits), hard=[1.0], progress=seen.append)
+    assert not seen
+
+
+def test_a_pose_that_drives_cannot_hold_is_told_when_nothing_fits():
+    with pytest.raises(
+        PantographError, match=r"at rest at 0 s 'shoulder' needs 40\.76 N m or N .* limit is 5"
+    ):
+        fit(move(ARM, "shoulder", [0, 1], [0, 1.0]), machine(ARM, force=5.0), hard=[1.0])
+
+
+def test_drives_give_less_at_speed_and_from_a_battery():
+    able = machine(ARM, force=10.0, top_speed=5.0, ampere=0.5, current=6.0)
+    np.testing.assert_allclose(given_by(able, np.array([20.0, -20.0]), np.zeros(2)), [6.0, -6.0])
+    rich = machine(ARM, force=10.0, top_speed=5.0)
+    np.testing.assert_allclose(given_by(rich, np.array([20.0, -20.0]), np.full(2, 2.5)), [5.0, -10.0])
+    np.testing.assert_allclose(given_by(rich, np.array([20.0, 3.0]), np.full(2, -9.0)), [10.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--velocity", "0"], "velocity must be a positive number, got 0.0"),
+        (["--current", "0"], "current of the battery must be a positive number"),
+        (["--current", "5"], "limits nothing without what it feeds"),
+        (["--velocity", "elbow=-1"], "velocity of 'elbow' must be a positive number"),
+        (["--jerk", "nan"], "jerk must be a"),
+        (["--velocity", "a=b"], "--velocity is a number, or JOINT=number, not 'a=b'"),
+        (["--top-speed", "1", "--top-speed", "2"], "--top-speed is given twice for all joints"),
+    ],
+)
+def test_wrong_options_are_told(tmp_path, options, message):
+    with pytest.raises(PantographError, match=message):
+        app_of_fit(tmp_path, options)
+
+
+def test_a_limit_for_all_and_one_for_a_joint(tmp_path):
+    done = app_of_fit(tmp_path, ["--velocity", "4", "--velocity", "elbow=1.6"])
+    assert re.search(r"shoulder +velocity +2\.25 +4 ", done.output)
+    assert re.search(r"elbow +velocity +1\.5 +1\.6 ", done.output)
+
+
+def app_of_fit(tmp_path, options):
+    import typer
+    from pantograph.controllers.fit.command import fit as command
+
+    app = typer.Typer()
+    app.command()(command)
+    scene = tmp_path / "swing.toml"
+    scene.write_text(
+        'duration = 1.0\n[[models]]\nfile = "planar_2r"\n'
+        '[[keys]]\njoint = "shoulder"\ntimes = [0, 1]\nvalues = [-1.0, 0.5]\n'
+        '[[keys]]\njoint = "elbow"\ntimes = [0, 1]\nvalues = [0.5, 1.5]\n'
+    )
+    return CliRunner().invoke(app, [str(scene), *options], catch_exceptions=False)
 
 
 @pytest.mark.parametrize(

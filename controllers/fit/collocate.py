@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...models import dof_names
 from ...sim.clip import Clip
 from ...sim.errors import PantographError
+from ...sim.kinds import SCALAR
 from .certify import examine
 from .contact import Phase
 from .fitted import Certificate, Fitted
@@ -54,8 +56,9 @@ def fit(
     missing relative to the largest) are cut, and limits are drawn in by what it exceeds them between points;
     the certificate says whether it holds in the end. ``progress`` is told in words what is at work.
 
-    Raises PantographError for keys outside of the clip, sites that do not exist or are not on the ground
-    where the pose is given, and when no motion fits, saying what is left over.
+    Raises PantographError for poses that no motion reaches in time, keys outside of the clip, sites that do
+    not exist or are not on the ground where the pose is given, and when no motion fits, saying what is left
+    over.
     """
     for t in hard:
         if not clip.start <= t <= clip.end:
@@ -65,6 +68,8 @@ def fit(
     if not clip.end > clip.start:
         raise PantographError("there is nothing to fit: no joint has two keys")
     wish = Wish(clip, tuple(hard), tuple(phases), effort, deviation, at_rest)
+    if text := _hopeless(wish, machine):
+        raise PantographError(f"no motion fits: {text}")
     nodes, margin, found, before = grid(wish, step), 1.0, None, None
     for round_ in range(refine + 1):
         missed = "" if found is None else f", missed {found.certificate.by_piece.max():.3g} tolerances"
@@ -80,6 +85,47 @@ def fit(
         nodes = _refined(nodes, certificate.by_piece)
     assert found is not None
     return found
+
+
+def _hopeless(wish: Wish, machine: Machine) -> str | None:
+    """What makes the given poses impossible whatever the motion between them is, in words, or None."""
+    clip, model = wish.clip, machine.model
+    t = np.unique([clip.start, *wish.hard])
+    q, names = clip.evaluate(t, left=True).q, dof_names(model)
+    scalar = np.isin(model.jnt_type[model.dof_jntid], SCALAR)
+    column = model.jnt_qposadr[model.dof_jntid]
+    for dof in np.flatnonzero(scalar & clip.dofs):
+        at, low, high = q[:, column[dof]], machine.low[dof], machine.high[dof]
+        beyond = np.maximum(low - at, at - high)
+        if beyond.max() > 1e-9:
+            k = int(beyond.argmax())
+            return f"the pose at {t[k]:g} s is {beyond[k]:.4g} rad or m beyond the range of {names[dof]!r}"
+        speed = np.abs(np.diff(at)) / np.maximum(np.diff(t), 1e-300)
+        if len(speed) and speed.max() > machine.velocity[dof]:
+            k = int(speed.argmax())
+            return (
+                f"from the pose at {t[k]:g} s to that at {t[k + 1]:g} s {names[dof]!r} moves at "
+                f"{speed[k]:.4g} rad/s or m/s in the mean, its limit is {machine.velocity[dof]:.4g}"
+            )
+    return None
+
+
+def _too_weak(wish: Wish, machine: Machine) -> str:
+    """A rest that the drives cannot hold, in words, or nothing: it may be passed, but hardly kept."""
+    ends = [t for t in (wish.clip.start, wish.clip.end) if t == wish.clip.start or t in wish.hard]
+    for t in ends if wish.at_rest else ():
+        if any(p.holds(np.array([t]))[0] for p in wish.phases):
+            continue
+        weight = machine.nominal.weight(wish.clip.evaluate(t, left=True).q)
+        over = np.maximum(weight - machine.force_high, machine.force_low - weight)
+        dof = np.where(machine.driven, over, -np.inf).argmax()
+        if machine.driven[dof] and over[dof] > 0:
+            limit = machine.force_high[dof] if weight[dof] > 0 else -machine.force_low[dof]
+            return (
+                f"; at rest at {t:g} s {dof_names(machine.model)[dof]!r} needs {abs(weight[dof]):.4g} N m "
+                f"or N to hold the pose, its limit is {limit:.4g}"
+            )
+    return ""
 
 
 def _tell(progress: Progress, words: str, iteration: int) -> None:
@@ -136,7 +182,7 @@ def _solve(
         raise PantographError(
             f"no motion was found that fits: constraints are missed by {rest:.2g} after "
             f"{stats['iter_count']} iterations ({words}); loosen hard keys, give more time, or a "
-            f"stronger machine"
+            f"stronger machine{_too_weak(problem.wish, true)}"
         )
     point, off = problem.unpack(np.asarray(done["x"]).ravel())
     wish, t = problem.wish, problem.t

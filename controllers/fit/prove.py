@@ -1,4 +1,4 @@
-"""A fitted motion tried: simulated by MuJoCo under a law, its forces cut at the machine's limits."""
+"""A fitted motion tried: simulated by MuJoCo under a law, its forces cut at what the drives can give."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def prove(
         rows.append(d.qpos.copy())
         errors.append(difference(m, d.qpos, target.q))
         tau, _ = law(t, d.qpos.copy(), d.qvel.copy(), target, None)
-        given = np.clip(tau, machine.force_low, machine.force_high)
+        given = given_by(machine, tau, d.qvel)
         cut += bool(np.any(given != tau))
         d.qfrc_applied[:] = given
         mujoco.mj_step(m, d, steps)
@@ -75,6 +75,18 @@ def prove(
         worst,
         cut / max(ticks, 1),
     )
+
+
+def given_by(machine: Machine, tau: Array, v: Array) -> Array:
+    """What drives give of forces tau (nv,) at velocities v (nv,): less the faster they turn, and together no
+    more than the battery does."""
+    low, high = machine.force_low.copy(), machine.force_high.copy()
+    for force, way in ((low, -1.0), (high, 1.0)):
+        limited = np.isfinite(force)
+        force[limited] *= np.maximum(1.0 - np.maximum(way * v, 0.0) / machine.top_speed, 0.0)[limited]
+    given = np.clip(tau, low, high)
+    draw = float(np.abs(given) @ machine.ampere)
+    return given * min(1.0, machine.current / draw) if draw > 0.0 else given
 
 
 def _lqr(fitted: Fitted, machine: Machine, period: float) -> LQR:
