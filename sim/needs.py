@@ -91,7 +91,8 @@ class Needs:
             reasons.append(f"{'; '.join(limited)} (physics.limits = false leaves them out)")
         h = float(m.opt.timestep) if solver.step == "auto" else solver.step
         if self.is_stiff(h) and solver.tolerance is None:
-            reasons.append(f"{self.stiff} are stiff for an explicit method at a step of {h:g} s")
+            stiff = f"{self.stiff} are stiff for an explicit method at a step of {h:g} s"
+            reasons.append(f"{stiff} (solver.tolerance lets it choose its steps)")
         return reasons + unsupported(m, keyed=keyed)
 
     def is_stiff(self, step: float) -> bool:
