@@ -21,7 +21,7 @@ HERE = Path(__file__).resolve().parent
 BUDGET = 5e-3  # [s], of the TRAC-IK protocol; of processor time, so that other work does not count
 LATE = 0.1  # [s] that peers get; what they solve within the budget is counted apart
 TOLERANCE = 1e-5
-RANDOM_TARGETS, PEER_TARGETS = 10_000, 2000
+RANDOM_TARGETS, PEER_TARGETS = 10_000, 5000
 PACKAGES = ("mink", "pin-pink", "daqp", "qpsolvers", "mujoco>=4")
 
 

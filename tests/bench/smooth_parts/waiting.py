@@ -70,20 +70,22 @@ def first_use(console):
             q, v, _, _ = models.states(model, 64, spread=0.3)
             np.savez(given, q=q, v=v)
             _process(xml, given, Path(folder) / "warm")  # libraries into the system's memory
+            busy = []
             for k in range(ROUNDS):
-                for found in runs.values():
+                for kind, found in runs.items():
                     seconds, said = _process(xml, given, Path(folder) / f"cache{k}")
                     found.append(seconds)
-        yield from _told(name, bar, np.array(runs["first"]), np.array(runs["second"]))
+                    busy += [said["cpu"]] * (kind == "first")
+        yield from _told(name, bar, np.array(runs["first"]), np.array(runs["second"]), np.median(busy))
         yield at_most(f"derivatives built unasked, {name}", said["built"].count("derivatives"), 0)
         bad = said["started"] + (not said["finite"])
         yield at_most(f"programs started without compiler, GPU and torch, {name}", bad, 0)
 
 
-def _told(name, bar, first, second):
+def _told(name, bar, first, second, busy):
     parts = dict(zip(PARTS, np.median(first, axis=0), strict=True))
     spread = np.quantile(first.sum(axis=1), [0.25, 0.75])
-    detail = f"quartiles {spread[0]:.3g} to {spread[1]:.3g}; "
+    detail = f"quartiles {spread[0]:.3g} to {spread[1]:.3g}, processor time {busy:.3g}; "
     detail += ", ".join(f"{part} {seconds:.3f}" for part, seconds in parts.items())
     whole = float(np.median(first.sum(axis=1)))
     yield at_most(f"first use, {name}: start of the process to a batch's rollout", whole, bar, "s", detail)
