@@ -221,6 +221,23 @@ def test_the_nearest_pose_keeps_loops_closed():
         assert loop.position < 1e-9
 
 
+def test_equalities_that_cannot_hold_are_named():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="s" pos="1 0 0"/></body>
+      <site name="w" pos="3 0 0"/></worldbody>
+      <equality><connect name="tie" site1="s" site2="w"/></equality></mujoco>""")
+    verdict = solve(model, JointValue("j", 0.1)).verdict
+    assert verdict.goals == ("tie",)
+    assert (verdict.kind, verdict.position) == ("out of reach", pytest.approx(2.0))
+
+
+def test_wishes_of_any_weight_are_served():
+    model, place = load_model("arm6"), [0.3, 0.1, 0.4]
+    for weight in (1e-200, 1e12):
+        solution = solve(model, [Position("tip", place), JointValue("waist", 9, weight=weight)])
+        assert solution.solved and solution.residuals[0].position < 1e-6
+
+
 # Obstacles, units and tolerances.
 
 

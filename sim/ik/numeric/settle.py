@@ -122,7 +122,8 @@ def _step(problem: Problem, x: Array, rows: Rows, cap: float) -> Array | None:
     if not Z.shape[1]:
         return None
     J = rows.J[0][:, columns] @ Z
-    H = J.T @ J + 1e-9 * np.eye(Z.shape[1])
+    H = J.T @ J
+    H += (1e-9 + 1e-14 * np.trace(H)) * np.eye(len(H))
     A, b = limit_rows(space, x[0], cap)
     z = minimise(H, J.T @ rows.r[0], A[:, columns] @ Z, np.maximum(b, 0.0)).x
     d = np.zeros(space.nv)

@@ -37,6 +37,8 @@ def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
     goals = problem.goals
     if nearest.met[0]:  # a slow end, as at a singular boundary, got there after all
         return _after_all(nearest)
+    if (open_loop := _open(problem, search)) is not None:
+        return open_loop
     unlimited = problem.without_limits()
     gaps = {goal: goal_gap(unlimited, goal, search.start) for goal in goals}
     blocked = [g for g in goals if _exceeds(problem, gaps[g], g)]
@@ -52,6 +54,24 @@ def diagnose(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
     if len(goals) == 1:
         return _out_of_reach(problem, search, nearest, goals[0], NO_GAP)
     return _together(problem, search, nearest)
+
+
+def _open(problem: Problem, search: Search) -> Diagnosis | None:
+    """The verdict that the model's own equalities cannot hold; None where they can."""
+    if not problem.loops:
+        return None
+    loops = problem.closures()
+    part = search.part(loops, 100, 6)
+    if len(part.solutions(search.best.q[:6])):
+        return None
+    end = brought(part)
+    search.iterations += part.iterations
+    r, metres = end.r[0], loops.metres
+    position, rotation = float(np.linalg.norm(r[metres])), float(np.linalg.norm(r[~metres]))
+    names = tuple(group.label for group in loops.groups)
+    left = _words(position, rotation)
+    reason = f"{' and '.join(names)} of the model cannot hold within the limits: {left} remain"
+    return _negative(problem, Verdict("out of reach", False, reason, position, rotation, goals=names))
 
 
 def excluded(problem: Problem, q: Array) -> bool:
