@@ -54,26 +54,42 @@ def choice(what: str, value: object, options: Sequence[str], where: str) -> str:
 
 
 def per_joint(
-    model: mujoco.MjModel, what: str, gain: Gain, *, missing: float = 0.0, zero: bool = True
+    model: mujoco.MjModel,
+    what: str,
+    gain: Gain,
+    *,
+    missing: float = 0.0,
+    zero: bool = True,
+    tracked: NDArray[np.bool_] | None = None,
 ) -> Array:
     """One number >= 0 (> 0 without ``zero``) a degree of freedom (nv,), from one for all or one a joint by
     name; "" stands for all joints, before others are named, which have ``missing`` without it.
 
-    Raises PantographError for what is no such number or no mapping of them, and a name that is no joint.
+    Raises PantographError for what is no such number or no mapping of them, and a name that is no joint, or,
+    with ``tracked`` (nv,), none of a tracked joint.
     """
     out = np.full(model.nv, missing)
     names = {name: j for j, name in enumerate(joint_names(model))}
+    able = (
+        names if tracked is None else {n: j for n, j in names.items() if tracked[model.dof_jntid == j].any()}
+    )
     for name, value in sorted(gain.items()) if isinstance(gain, Mapping) else [("", gain)]:
         if name and name not in names:
-            raise PantographError(f"{what}: {unknown('joint', str(name), names)}")
+            raise PantographError(f"{what}: {unknown('joint', str(name), able)}")
+        if name and name not in able:
+            raise PantographError(
+                f"{what} of {name!r} has no effect: that joint is not tracked; tracked: {', '.join(able)}"
+            )
         of = f"{what} of {name!r}" if name else what
         out[model.dof_jntid == names[name] if name else slice(None)] = positive(of, value, zero=zero)
     return out
 
 
-def limit_per_joint(model: mujoco.MjModel, what: str, limit: Gain | None) -> Array:
+def limit_per_joint(
+    model: mujoco.MjModel, what: str, limit: Gain | None, *, tracked: NDArray[np.bool_] | None = None
+) -> Array:
     """As :func:`per_joint` for limits: positive, infinite for joints that are not named, and without any."""
-    return per_joint(model, what, {} if limit is None else limit, missing=np.inf, zero=False)
+    return per_joint(model, what, {} if limit is None else limit, missing=np.inf, zero=False, tracked=tracked)
 
 
 def force_weights(
@@ -91,7 +107,7 @@ def force_weights(
         scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(weight)))
         weights = 1.0 / np.maximum(scale, 1e-9) ** 2
     else:
-        weights = per_joint(model, f"{what} force", force)
+        weights = per_joint(model, f"{what} force", force, tracked=tracked)
     if not (weights[tracked] > 0).all():
         raise PantographError(f"{what} force: every joint that it drives must cost something")
     return np.asarray(weights[tracked])

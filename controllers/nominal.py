@@ -28,6 +28,7 @@ class Nominal:
         self.model = copy.copy(model)
         self.model.actuator_gainprm[:] = 0.0
         self.model.actuator_biasprm[:] = 0.0
+        self.model.jnt_actfrclimited[:] = 0
         disable = mujoco.mjtDisableBit
         self.model.opt.disableflags |= int(disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT)
         self.compiled = not unsupported(self.model)

@@ -43,11 +43,11 @@ class PD:
         self.data = mujoco.MjData(model)
         inertia = felt_inertia(model, q0)
         w = 2.0 * np.pi * frequency
-        self.kp = inertia * w**2 if kp is None else per_joint(model, "the PD law's kp", kp)
+        self.kp = inertia * w**2 if kp is None else per_joint(model, "the PD law's kp", kp, tracked=tracked)
         self.kd = (
             2.0 * damping * np.sqrt(self.kp * inertia)
             if kd is None
-            else per_joint(model, "the PD law's kd", kd)
+            else per_joint(model, "the PD law's kd", kd, tracked=tracked)
         )
 
     def start(self) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.control import Target
-from .gains import Gain, choice, felt_inertia, force_limits, per_joint, positive, unit_free_gains
+from .drives import Drives
+from .gains import Gain, choice, felt_inertia, per_joint, positive, unit_free_gains
 from .nominal import Nominal, difference
 
 Array = NDArray[np.float64]
@@ -34,8 +35,8 @@ class PID:
     Gains follow from ``frequency`` [Hz] and ``damping`` as for PD, Ki = Kp w / 10; or ``kp``, ``ki``, ``kd``
     are given (one number, or one a joint by name). ``filter`` [Hz] is the corner of the velocity filter
     (default: ten times ``frequency``). ``feedforward``: nothing, the weight at the target, or all forces that
-    the target's motion needs. Beyond what its drives can give the integral runs back within ``windup`` [s]
-    (default: the geometric mean of Ki/Kp and Kd/Kp times).
+    the target's motion needs. Beyond what its drives can give, less towards ``top_speed`` [rad/s, m/s], the
+    integral runs back within ``windup`` [s] (default: the geometric mean of Ki/Kp and Kd/Kp times).
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class PID:
         model: mujoco.MjModel,
         tracked: NDArray[np.bool_],
         q0: Array,
+        top_speed: Gain | None = None,
         *,
         frequency: float = 5.0,
         damping: float = 1.0,
@@ -59,17 +61,19 @@ class PID:
         self.model, self.tracked, self.feedforward = model, tracked, feedforward
         self.kp, self.kd = unit_free_gains(felt_inertia(model, q0), frequency, damping)
         if kp is not None:
-            self.kp = per_joint(model, "the PID law's kp", kp)
+            self.kp = per_joint(model, "the PID law's kp", kp, tracked=tracked)
         if kd is not None:
-            self.kd = per_joint(model, "the PID law's kd", kd)
-        self.ki = self.kp * w / 10.0 if ki is None else per_joint(model, "the PID law's ki", ki)
+            self.kd = per_joint(model, "the PID law's kd", kd, tracked=tracked)
+        self.ki = (
+            self.kp * w / 10.0 if ki is None else per_joint(model, "the PID law's ki", ki, tracked=tracked)
+        )
         corner = 10.0 * frequency if filter is None else positive("the PID law's filter", filter)
         self.lag = 1.0 / (2.0 * np.pi * corner)
         if windup is None:
             self.windup = np.sqrt(_ratio(self.kp, self.ki, 1.0) * _ratio(self.kd, self.kp, 0.1))
         else:
             self.windup = np.full(model.nv, positive("the PID law's windup", windup))
-        self.low, self.high = force_limits(model)
+        self.drives = Drives(model, tracked, top_speed=top_speed)
         self.nominal = Nominal(model)
 
     def start(self) -> PIDMemory:
@@ -85,7 +89,7 @@ class PID:
         velocity = v if first else v + (memory.velocity - v) * np.exp(-dt / self.lag)
         error = difference(self.model, q, target.q)
         wanted = self._forward(target) + self.kp * error + memory.integral + self.kd * (target.v - velocity)
-        tau = np.clip(wanted, self.low, self.high)
+        tau = np.clip(wanted, *self.drives.at(v))
         # exact over a sample with error and excess held: the way back never overshoots
         back = 1.0 - np.exp(-dt / self.windup)
         integral = memory.integral + self.ki * error * dt + (tau - wanted) * back

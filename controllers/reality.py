@@ -9,11 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models import name_of
 from ..sim.control import Law, Target
-from ..sim.errors import PantographError
 from ..sim.kinds import SCALAR
-from .gains import Gain, choice, felt_inertia, force_limits, limit_per_joint, per_joint, positive
+from .drives import Drives
+from .gains import Gain, choice, felt_inertia, per_joint, positive
 from .ilc import Fed, load_learned
 from .nominal import difference
 from .observers import Kalman, Observer, VelocityFilter
@@ -24,9 +23,9 @@ OBSERVERS = ("none", "filter", "kalman", "extended")
 
 
 class LoopMemory(NamedTuple):
-    """Memory of a loop: the law's own and the observer's, forces on their way (oldest first) and applied,
-    where the encoders' plays have their middles (scalar joints,), the rotors of gears with play, and which
-    drives gave all they could (nv,)."""
+    """Memory of a loop: the law's own and the observer's, forces on their way (oldest first) and those that
+    the motors gave, where the encoders' plays have their middles (scalar joints,), the rotors of gears with
+    play, and which drives gave all they could (nv,)."""
 
     law: Any
     observer: Any
@@ -44,18 +43,21 @@ class Loop:
     - ``backlash`` [rad, m]: full width of the play between joint and encoder: what is measured follows the
       joint only once that has taken up the play;
     - ``observer``: where velocities come from. "none": they are measured; "filter": differences of positions
-      through a filter of ``corner`` [Hz]; "kalman", "extended": by the law's model;
+      through a filter of ``corner`` [Hz]; "kalman", "extended": by the law's model, measured positions having
+      ``noise`` [rad, m] (default: what the encoder rounds away, or 1e-4) and accelerations that the model
+      does not know being about ``push`` [rad/s^2, m/s^2]. It knows what motors were told to give, not what
+      play and friction leave of it; joints ``keyed`` (nv,) are known to be where their keys say;
     - ``delay`` [s]: forces take effect that much later, rounded up to whole periods;
-    - ``saturation``: forces are cut at this fraction of what the drives can give (see also ``top_speed``);
-    - ``top_speed`` [rad/s, m/s]: motor force falls linearly to zero at this joint speed;
+    - ``saturation``, ``top_speed`` [rad/s, m/s]: what motors give, see
+      :class:`~pantograph.controllers.drives.Drives`;
     - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
       :class:`~pantograph.controllers.play.Play`;
     - ``learned``: file of forces that :mod:`~pantograph.controllers.ilc` has learned, added to the law's;
     - ``friction`` [N m, N]: dry friction that drives lose, smoothed below ``stiction`` [rad/s, m/s], or below
       the speed that it stops within a period.
 
-    Raises PantographError for values that make no sense, and for ``saturation`` and ``top_speed`` of drives
-    ``tracked`` (nv,) that can give anything.
+    Raises PantographError for values that make no sense, for what drives do at joints that are not
+    ``tracked`` (nv,), and for ``saturation`` and ``top_speed`` of drives that can give anything.
     """
 
     def __init__(
@@ -65,11 +67,14 @@ class Loop:
         tracked: NDArray[np.bool_],
         q0: Array,
         period: float,
+        keyed: NDArray[np.bool_] | None = None,
         *,
         encoder: float = 0.0,
         backlash: Gain = 0.0,
         observer: str = "none",
         corner: float = 30.0,
+        noise: Gain | None = None,
+        push: Gain = 5.0,
         delay: float = 0.0,
         saturation: float | None = None,
         top_speed: Gain | None = None,
@@ -84,26 +89,43 @@ class Loop:
         self.counts = positive("encoder", encoder, zero=True)
         self.backlash = per_joint(model, "backlash", backlash)
         self.late = int(np.ceil(positive("delay", delay, zero=True) / period - 1e-9))
-        share = 1.0 if saturation is None else positive("saturation", saturation)
-        self.low, self.high = (share * limit for limit in force_limits(model))
-        self.top = np.where(tracked, limit_per_joint(model, "top_speed", top_speed), np.inf)
-        for word, slowed in (("saturation", share != 1.0), ("top_speed", np.isfinite(self.top))):
-            self._needs_limits(word, tracked & slowed)
-        self.friction = per_joint(model, "friction", friction)
+        self.drives = Drives(model, tracked, saturation, top_speed)
+        self.friction = per_joint(model, "friction", friction, tracked=tracked)
         stopped = self.friction * period / felt_inertia(model, q0)
         self.stiction = np.maximum(positive("stiction", stiction), stopped)
-        self.play = Play(model, np.where(tracked, per_joint(model, "play", play), 0.0), period)
+        width = per_joint(model, "play", play, tracked=tracked)
+        self.play = Play(model, np.where(tracked, width, 0.0), period)
         if learned:
             self.law = Fed(law, load_learned(learned, model.nv, period), period)
-        self.observer = _observer(observer, model, q0, positive("corner", corner), self.counts)
-
-    def _needs_limits(self, word: str, dofs: NDArray[np.bool_]) -> None:
-        for dof in np.flatnonzero(dofs & ~np.isfinite(self.high - self.low)):
-            joint = name_of(self.model, "joint", int(self.model.dof_jntid[dof]))
-            raise PantographError(
-                f"{word} needs to know what the drive of {joint!r} can give: it is an ideal force, or its "
-                "actuator has no ctrlrange or forcerange"
+        self.keyed = np.zeros(model.nv, dtype=bool) if keyed is None else keyed
+        self.keyed_q = np.zeros(model.nq, dtype=bool)
+        for joint in np.unique(model.dof_jntid[self.keyed]):
+            ends = (*model.jnt_qposadr, model.nq)
+            self.keyed_q[ends[joint] : ends[joint + 1]] = True
+        self.observer: Observer | None = None
+        positive("corner", corner)
+        if observer == "filter":
+            self.observer = VelocityFilter(model, q0, corner=corner)
+        elif observer != "none":
+            spread = self._rounding() if noise is None else noise
+            self.observer = Kalman(
+                model, q0, self.keyed, noise=spread, push=push, extended=observer == "extended"
             )
+
+    def _rounding(self) -> Array:
+        """Standard deviation (nv,) [rad, m] of what the encoders round away: an error spread evenly over the
+        width w of a count has w / sqrt(12)."""
+        out = np.full(self.model.nv, 1e-4)
+        if self.counts:
+            scalar, unit = self._counted()
+            out[self.model.jnt_dofadr[scalar]] = np.maximum(unit / np.sqrt(12.0), 1e-6)
+        return out
+
+    def _counted(self) -> tuple[NDArray[np.intp], Array]:
+        """Scalar joints, and what a count of their encoders is [rad, m]."""
+        scalar = np.flatnonzero(np.isin(self.model.jnt_type, SCALAR))
+        turns = self.model.jnt_type[scalar] == mujoco.mjtJoint.mjJNT_HINGE
+        return scalar, np.where(turns, 2.0 * np.pi, 1.0) / self.counts
 
     def start(self) -> LoopMemory:
         """Nothing on its way, nothing measured yet."""
@@ -117,18 +139,20 @@ class Loop:
     ) -> tuple[Array, LoopMemory]:
         """Joint forces (nv,) that arrive now; see :class:`~pantograph.sim.control.Law`."""
         y, middles = self._measure(q, memory.middles)
+        y = np.where(self.keyed_q, target.q, y) if self.keyed.any() else y
         seen, q_seen, v_seen = memory.observer, y, v
         if self.observer is not None:
-            seen = self.observer.update(seen, t, y, memory.applied)
-            q_seen, v_seen = seen.q, seen.v
+            seen = self.observer.update(seen, t, y, memory.applied, target if self.keyed.any() else None)
+            q_seen, v_seen = seen.q, np.where(self.keyed, target.v, seen.v) if self.keyed.any() else seen.v
         tau, inner = self.law(t, q_seen, v_seen, target, memory.law)
         queue, rotors = (*memory.queue, tau), memory.rotors
         given, cut = self._drive(queue[0], v)
+        told = given
         if len(self.play.dofs):
             at = difference(self.model, self.model.qpos0, q)
             given, rotors = self.play.pass_on(given, at, v, rotors or self.play.start(at, v))
         given = np.asarray(given - self.friction * np.tanh(v / self.stiction))
-        return given, LoopMemory(inner, seen, queue[1:], given, middles, rotors, cut)
+        return given, LoopMemory(inner, seen, queue[1:], told, middles, rotors, cut)
 
     def _measure(self, q: Array, play: Array | None) -> tuple[Array, Array | None]:
         """What the encoders show, (nq,), and where the middles of the plays are now."""
@@ -140,21 +164,19 @@ class Loop:
             play = y[at] if play is None else np.clip(play, y[at] - half, y[at] + half)
             y[at] = play
         if self.counts:
-            unit = np.where(m.jnt_type[scalar] == mujoco.mjtJoint.mjJNT_HINGE, 2.0 * np.pi, 1.0) / self.counts
+            _, unit = self._counted()
             y[at] = np.round(y[at] / unit) * unit
         return y, play
 
     def _drive(self, tau: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
         """What motors give of the forces asked for, (nv,), and whether it is all they can."""
-        # a motor gives its whole force against its motion, and none beyond its top speed
-        left = np.clip(1.0 - np.abs(v) / self.top, 0.0, 1.0)
-        high, low = np.where(v > 0, left * self.high, self.high), np.where(v < 0, left * self.low, self.low)
+        low, high = self.drives.at(v)
         return np.clip(tau, low, high), (tau <= low) | (tau >= high)
 
 
 LOOP_WORDS = (
-    "encoder", "backlash", "observer", "corner", "delay", "saturation", "top_speed", "play", "friction",
-    "stiction", "learned",
+    "encoder", "backlash", "observer", "corner", "noise", "push", "delay", "saturation", "top_speed", "play",
+    "friction", "stiction", "learned",
 )  # fmt: skip
 
 
@@ -165,16 +187,7 @@ def with_reality(
     q0: Array,
     period: float,
     words: Mapping[str, Any],
+    keyed: NDArray[np.bool_] | None = None,
 ) -> Law:
     """``law`` inside a :class:`Loop` when any of ``words`` asks for one."""
-    return Loop(law, model, tracked, q0, period, **words) if words else law
-
-
-def _observer(kind: str, model: mujoco.MjModel, q0: Array, corner: float, counts: float) -> Observer | None:
-    if kind == "none":
-        return None
-    if kind == "filter":
-        return VelocityFilter(model, q0, corner=corner)
-    # an encoder's count is uniform noise of its own width: standard deviation width / sqrt(12)
-    noise = max(2.0 * np.pi / counts / np.sqrt(12.0), 1e-6) if counts else 1e-4
-    return Kalman(model, q0, noise=noise, extended=kind == "extended")
+    return Loop(law, model, tracked, q0, period, keyed, **words) if words else law

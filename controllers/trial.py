@@ -168,7 +168,9 @@ def _learned(plan: Plan, true: Problem, words: Mapping[str, Any], period: float)
     tracked = problem.dofs(Role.TRACKED)
 
     def around(law: Law) -> Law:
-        return with_reality(law, problem.model, tracked, problem.state0.q, period, real)
+        return with_reality(
+            law, problem.model, tracked, problem.state0.q, period, real, problem.dofs(Role.KEYED)
+        )
 
     def law() -> Law:
         return make_law(base, problem, own, period)

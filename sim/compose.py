@@ -52,10 +52,12 @@ def make_law(
     """The law ``name`` for a problem, sampled every ``period`` [s].
 
     A law takes what it needs of the problem by the names of its positional arguments, ``parameters`` by its
-    keywords; those of :class:`~pantograph.controllers.reality.Loop` put it behind real sensors and drives.
+    keywords; those of :class:`~pantograph.controllers.reality.Loop` put it behind real sensors and drives,
+    whose limits it knows.
     ``model`` is what the law believes the machine to be (default: what it is). Raises SceneError for an
     unknown law or parameter, or a bad value.
     """
+    from ..controllers.drives import Drives
     from ..controllers.reality import LOOP_WORDS, with_reality
 
     check_law(name, parameters)
@@ -78,8 +80,13 @@ def make_law(
     own = {word: value for word, value in parameters.items() if word not in LOOP_WORDS}
     reality = {word: value for word, value in parameters.items() if word in LOOP_WORDS}
     try:
+        offered["top_speed"] = reality.get("top_speed")
+        drives = Drives(believed, offered["tracked"], reality.get("saturation"), offered["top_speed"])
+        offered["model"] = drives.told(believed)
         law = factory(*(offered[word] for word in needed), **own)
-        return with_reality(law, believed, offered["tracked"], problem.state0.q, period, reality)
+        return with_reality(
+            law, believed, offered["tracked"], problem.state0.q, period, reality, offered["keyed"]
+        )
     except (TypeError, PantographError) as e:
         raise SceneError(str(e)) from e
 

@@ -90,7 +90,7 @@ class MPC:
         self.powers = _moves(positive("the MPC's horizon", horizon), period, whole("the MPC's fine", fine))
         low, high = force_limits(model)
         self.low, self.high = low[self.inputs], high[self.inputs]
-        self.slew = limit_per_joint(model, "the MPC's slew", slew)[self.inputs] * period
+        self.slew = limit_per_joint(model, "the MPC's slew", slew, tracked=tracked)[self.inputs] * period
         ranges, limited = model.jnt_range[model.dof_jntid], model.jnt_limited[model.dof_jntid].astype(bool)
         top = limit_per_joint(model, "the MPC's speed", speed)
         self.x_low = np.concatenate(
