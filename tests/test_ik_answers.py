@@ -221,6 +221,14 @@ def test_the_nearest_pose_keeps_loops_closed():
         assert loop.position < 1e-9
 
 
+@pytest.mark.parametrize("far", [3.0, 30.0, 3e3, 1e6])
+def test_a_floating_body_goes_as_far_as_it_is_asked(far):
+    model = load_model("puppet")
+    left = far * np.array([0.6, -0.8, 0.1])
+    right = np.add(left, [0.2, 0.1, 0])
+    assert solve(model, [Position("left_hand", left), Position("right_hand", right)]).solved
+
+
 def test_equalities_that_cannot_hold_are_named():
     model = mujoco.MjModel.from_xml_string("""
     <mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="s" pos="1 0 0"/></body>

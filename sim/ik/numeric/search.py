@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..chains.solver import racer_of
+from ..goals import Pose, Position
 from ..problem import Problem
 from .descend import LONGEST, Descent, descend
 
 Array = NDArray[np.float64]
 AT_LIMIT = 1e-6  # [rad or m] beyond a limit: clipped, it may still be right
+_FAR = 10.0  # [lengths of the problem] that bounded steps may not come
 _BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found
 
 
@@ -56,14 +58,14 @@ class Search:
 
         All that were found, so possibly many alike; none (0, nq) when all restarts failed.
         """
-        space, moved = self.problem.space, self.problem.moved
+        space = self.problem.space
         found = [np.zeros((0, space.nq))]
         inside = first[space.excess(first).max(axis=1, initial=0.0) <= AT_LIMIT]
         if len(inside):
             found.append(self._attempt(inside, iterations=12))
             self.direct = len(found[-1]) > 0
         if not len(found[-1]):
-            starts = np.stack([self.start, space.middle(self.start, moved)])
+            starts = np.stack([self.start, self._carried()])
             found.append(self._attempt(starts, iterations=40, first=True))
             end = self._all[-1]
             self.direct = bool(end.met[0]) and self._near(end.q[:1])
@@ -79,6 +81,20 @@ class Search:
             found.append(self._attempt(self._random(n), first=True))
             size = next(blocks, size)
         return np.concatenate(found)
+
+    def _carried(self) -> Array:
+        """Mid-range, with floating bodies carried to where their first goal of a place is, if that is far."""
+        q = self.problem.space.middle(self.start, self.problem.moved)
+        for k, v in self.problem.space.shifts:
+            for goal in self.problem.goals if self.problem.moved[v] else ():
+                if isinstance(goal, (Position, Pose)) and goal.relative_to is None:
+                    frame = self.problem.kinematics.frame(goal.at)
+                    place = np.asarray(goal.target if isinstance(goal, Position) else goal.position)
+                    way = place - frame.pose(q)[:3, 3]
+                    if v in frame.dofs and np.linalg.norm(way) > _FAR * self.problem.scale:
+                        q[k : k + 3] += way
+                        break
+        return q
 
     def _near(self, q: Array) -> bool:
         """Whether q (1, nq) is no further from the start than a linear model reaches."""
