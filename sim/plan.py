@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from ..models import name_of
@@ -91,6 +92,8 @@ def plan_setup(setup: Setup) -> Plan:
         raise report(mistakes, scene._file, scene._lines)
     engine = _engine(needs)
     h, step = _step(setup, engine.what, needs.period)
+    if engine.what == "contact" and (mistakes := _activations(setup, h)):
+        raise report(mistakes, scene._file, scene._lines)
     integrator = _integrator(needs, engine.what, h)
     problem = Problem(
         model=setup.model,
@@ -199,6 +202,22 @@ def _engines(scene: Scene, reasons: list[str]) -> list[Mistake]:
             message = "the contact engine, which the solver asks for, has soft limits as the model file says"
         mistakes.append(Mistake(("physics", "restitution"), f"{message}; leave it out", needs=("solver",)))
     return mistakes
+
+
+def _activations(setup: Setup, h: float) -> list[Mistake]:
+    """Activations too quick for MuJoCo, which filters them by Euler's method whatever the integrator."""
+    m = setup.model
+    filters = (m.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTER)) & (setup.drives != Drive.OFF)
+    constant = m.actuator_dynprm[:, 0]
+    return [
+        Mistake(
+            ("solver", "step"),
+            f"the activation of actuator {name_of(m, 'actuator', int(i))!r} has a time constant of "
+            f"{constant[i]:g} s: the contact engine, which runs this scene, needs steps below "
+            f"{2 * constant[i]:g} s for it, not {h:g} s (or dyntype = 'filterexact' in the model)",
+        )
+        for i in np.flatnonzero(filters & (2.0 * constant <= h))
+    ]
 
 
 def _law(problem: Problem, scene: Scene) -> list[Mistake]:
