@@ -172,14 +172,14 @@ def gains(
     own = loaded.controller
     law = law or (own.law if own else "pd")
     words = own.parameters if own and own.law == law else {}
-    system, K, says = loop_of(make_plan(loaded), law, words, t=at)
+    system, K, says, mechanism = loop_of(make_plan(loaded), law, words, t=at)
     if joint and joint not in system.inputs:
         raise PantographError(f"no tracked joint {joint!r}; there is: {', '.join(system.inputs)}")
     console.print(f"linearised {says}", soft_wrap=True, highlight=False)
-    verdicts = [design.controllability(system), design.stabilisability(system)]
+    verdicts = [design.controllability(mechanism), design.stabilisability(mechanism)]
     if words.get("observer", "none") != "none":
-        measured = np.eye(len(system.A))[: len(system.A) // 2]
-        verdicts += [design.observability(system, measured), design.detectability(system, measured)]
+        measured = np.eye(len(mechanism.A))[: len(mechanism.A) // 2]
+        verdicts += [design.observability(mechanism, measured), design.detectability(mechanism, measured)]
     for verdict in verdicts:
         console.print(verdict.says, soft_wrap=True, highlight=False)
     found = [design.margins(system, K, input=i) for i in range(len(system.inputs))]
@@ -203,6 +203,9 @@ def _margins(system: Any, found: list[Any]) -> Table:
     table = _columns("joint", "phase deg", "delay ms", "least gain", "most gain", "disk")
     table.title = f"margins of each loop, the others closed, sampled every {system.period * 1e3:g} ms"
     for name, m in zip(system.inputs, found, strict=True):
+        if not m.stable:
+            table.add_row(name, "unstable", *["-"] * 4)
+            continue
         low, up = m.gain
         table.add_row(
             name,

@@ -399,7 +399,7 @@ def balancing(law, duration=1.0, **words):
 def test_the_loop_of_a_law_is_the_one_it_was_designed_for():
     words = {"goal": {"hinge": 0.0}}
     plan = make_plan(balancing("lqr", **words))
-    found, K, _ = loop_of(plan, "lqr", words)
+    found, K, *_ = loop_of(plan, "lqr", words)
     p = plan.problem
     tracked = np.array([True, False])
     law = LQR(p.model, tracked, p.state0.q, p.clip, 0.01, 1.0, ~(tracked | True), **words)
@@ -425,7 +425,7 @@ def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
     )
     words = {"kp": {"shoulder": 300.0, "elbow": 200.0}, "kd": {"shoulder": 30.0, "elbow": 20.0}}
     plan = make_plan(scene)
-    found, K, _ = loop_of(plan, "pd", words, t=0.4)
+    found, K, *_ = loop_of(plan, "pd", words, t=0.4)
     assert found.states[:2] == ("shoulder", "elbow")
     n = len(found.states) // 2
     np.testing.assert_allclose(K[:2, n : n + 2], np.diag([30.0, 20.0]), atol=1e-5)
@@ -444,7 +444,7 @@ def test_gains_of_a_law_are_its_own_whatever_the_scene_keys():
 
 def test_the_delay_that_a_loop_stands_is_the_one_that_a_scene_stands():
     words = {"goal": {"hinge": 0.0}, "position": 10.0}
-    found, K, _ = loop_of(make_plan(balancing("lqr", **words)), "lqr", words)
+    found, K, *_ = loop_of(make_plan(balancing("lqr", **words)), "lqr", words)
     ticks = int(margins(found, K).delay / 0.01)
     assert 1 <= ticks <= 20
     stood, lost = (run(balancing("lqr", duration=8.0, delay=0.01 * d, **words)) for d in (ticks, ticks + 2))
@@ -455,11 +455,11 @@ def test_the_delay_that_a_loop_stands_is_the_one_that_a_scene_stands():
 def test_both_engines_make_the_same_loop_where_nothing_touches():
     words = {"goal": {"hinge": 0.0}}
     scene = balancing("lqr", **words)
-    exact, K, says = loop_of(make_plan(scene), "lqr", words)
+    exact, K, says, _ = loop_of(make_plan(scene), "lqr", words)
     assert "about the keys at t = 0 s, by exact derivatives; joint limits left out" in says
     still = {"initial": scene.initial.model_copy(update={"position": {"hinge": 0.0}})}
     other = scene.model_copy(update={"solver": scene.solver.model_copy(update={"engine": "contact"})} | still)
-    theirs, same, says = loop_of(make_plan(other), "lqr", words)
+    theirs, same, says, _ = loop_of(make_plan(other), "lqr", words)
     assert "differences of the contact engine; nothing touches" in says
     np.testing.assert_allclose(theirs.A, exact.A, atol=1e-7)
     np.testing.assert_allclose(theirs.B, exact.B, atol=1e-7)
@@ -483,8 +483,8 @@ def test_a_loop_with_contact_is_the_motion_that_the_contact_engine_makes(tmp_pat
         controller={"law": "pd", "period": period, **words},
     )
     plan = make_plan(scene)
-    found, K, says = loop_of(plan, "pd", words | {"delay": 0.01}, t=3.0)
-    assert "touching: foot and world; left out of the loop: delay" in says
+    found, K, says, _ = loop_of(plan, "pd", words | {"friction": 0.01}, t=3.0)
+    assert "touching: foot and world; left out of the loop: friction" in says
     predicted = closed_loop(found, K).A
     model, data = plan.problem.model, mujoco.MjData(plan.problem.model)
     model.opt.timestep, model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 _RANK = 1e-9  # singular values below this fraction of the largest count as zero
 _EDGE = 1e-9  # poles so near the edge of stability lie on it
+_SPLIT = 1e-7  # rounding splits double poles by about so much
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,8 @@ class Margins:
 
     ``gain``: factors (least < 1, greatest > 1) on the loop gain; ``phase`` [rad] of lag; ``delay`` [s];
     ``disk``: distance of the loop's curve to -1 (1 / peak sensitivity), the one number that covers gain and
-    phase together; ``crossover`` [rad/s] where the phase margin is.
+    phase together; ``crossover`` [rad/s] where the phase margin is. An unstable loop has no room at all: its
+    factors are 1, the others 0.
     """
 
     gain: tuple[float, float]
@@ -183,11 +185,14 @@ class Margins:
     delay: float
     disk: float
     crossover: float
+    stable: bool = True
 
 
 def margins(system: LinearSystem, K: ArrayLike, *, input: int = 0, points: int = 2000) -> Margins:
     """Margins of the loop cut at one ``input``; crossings are refined between ``points`` frequencies."""
     poles = linalg.eigvals(system.A - system.B @ np.asarray(K, dtype=float))
+    if growth(poles, system.period) > 0.0:
+        return Margins((1.0, 1.0), 0.0, 0.0, 0.0, np.nan, stable=False)
     if system.period is None:
         sizes = np.abs(np.concatenate([linalg.eigvals(system.A), poles]))
         high = 1e3 * max(sizes.max(), 1e-3)
@@ -221,6 +226,15 @@ def margins(system: LinearSystem, K: ArrayLike, *, input: int = 0, points: int =
             factor = -1.0 / value
             upper, lower = (min(upper, factor), lower) if factor > 1 else (upper, max(lower, factor))
     return Margins((lower, upper), phase, delay, float(np.abs(1.0 + L).min()), crossover)
+
+
+def growth(poles: ArrayLike, period: float | None = None) -> float:
+    """Rate [1/s] of the fastest growing of ``poles``, 0 where none grows: what lasts counts as such, also
+    double poles that rounding splits."""
+    poles = np.asarray(poles, dtype=complex)
+    rate = float(poles.real.max() if period is None else np.log(np.abs(poles).max()) / period)
+    edge = _SPLIT * max(1.0, float(np.abs(poles).max())) if period is None else _SPLIT / period
+    return rate if rate > edge else 0.0
 
 
 def _as_seen(system: LinearSystem, K: ArrayLike, input: int) -> Complex:

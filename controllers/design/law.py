@@ -1,4 +1,4 @@
-"""The linear loop that a law of a scene makes: the mechanism, and the gains of the law."""
+"""The linear loop that a law of a scene makes: the mechanism, the gains of the law, and its memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import name_of
+from ...models import dof_names, name_of
 from ...sim.compose import make_engine, make_law
 from ...sim.control import Law, Sampled, Target
 from ...sim.engines.interface import Problem, Role
@@ -19,18 +19,21 @@ from ..nominal import Nominal, moved
 from ..preview import aimed
 from ..reality import LOOP_WORDS
 from .linear import LinearSystem, held, linearise, linearise_contact
+from .memory import LinearLaw, linear_law, numbers
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+_MOST = 200  # numbers of a memory that become states
 
 
 class LinearLoop(NamedTuple):
-    """The sampled mechanism, the gains K (m, n) of a law, and in words about what they are and what is left
-    out."""
+    """The sampled mechanism with the law's memory as further states, the gains K (m, n) of both, in words
+    about what they are and what is left out, and the mechanism alone."""
 
     system: LinearSystem
     K: Array
     says: str
+    mechanism: LinearSystem
 
 
 class _Point(NamedTuple):
@@ -48,11 +51,12 @@ def loop_of(
 ) -> LinearLoop:
     """The loop of ``law`` at time ``t`` [s], by derivatives of the engine that the plan chose.
 
-    On the smooth engine they are exact, about the keys, with the law's memory as at its start; joints without
-    keys are at the law's ``goal`` or where they start. On the contact engine they are differences, contacts
-    and limits included, about the state that a run under the law has at ``t``. K is minus the derivative of
-    the law's forces by the state, by centred differences of ``step`` [rad, m, and per second]; what sensors
-    and drives do is left out. Raises PantographError when the scene has nothing to control, for times outside
+    On the smooth engine they are exact, about the keys, with the law's memory as after its first sample;
+    joints without keys are at the law's ``goal`` or where they start. On the contact engine they are
+    differences, contacts and limits included, about the state that a run under the law has at ``t``. K is
+    minus the derivative of the law's forces by state and memory, by centred differences of ``step`` [rad, m,
+    and per second]. Delays and velocity filters are part of the memory; what else sensors and drives do is
+    left out. Raises PantographError when the scene has nothing to control, for times outside
     it, and for a run that does not reach ``t``.
     """
     problem, period = plan.problem, plan.period
@@ -60,7 +64,7 @@ def loop_of(
         raise PantographError("this scene has nothing to control: give joints the role 'tracked'")
     if not 0.0 <= t <= problem.duration:
         raise PantographError(f"time {t:g} s is outside the scene, which lasts {problem.duration:g} s")
-    m, own = problem.model, {word: value for word, value in words.items() if word not in LOOP_WORDS}
+    m, own = problem.model, {word: value for word, value in words.items() if word not in _left(words)}
     made = make_law(law, problem, own, period)
     tracked, keyed = problem.dofs(Role.TRACKED), problem.dofs(Role.KEYED)
     if plan.engine.what == "contact":
@@ -70,19 +74,24 @@ def loop_of(
         mechanism = linearise_contact(m, at.q, at.v, pushed, inputs=tracked, keyed=keyed, a_keyed=a)
         says = f"about the run at t = {at.t:g} s, by differences of the contact engine; {_touching(m, at.q)}"
     else:
-        at = _on_keys(problem, made, own, t)
+        at = _on_keys(problem, made, own, t, period)
         need = Nominal(m).inverse(*at.target)
         mechanism = linearise(m, at.q, at.v, need, inputs=tracked, keyed=keyed, a_keyed=at.target.a)
         says = f"about the keys at t = {t:g} s, by exact derivatives{_left_out(problem)}"
-    left = ", ".join(word for word in words if word in LOOP_WORDS)
-    says += f"; left out of the loop: {left}" if left else ""
-    return LinearLoop(held(mechanism, period), _gains(made, at, m, tracked, keyed, step), says)
+    left = list(_left(words))
+    if len(numbers(at.memory)) > _MOST:
+        at, left = at._replace(memory=made.start()), [*left, "the law's memory"]
+    says += f"; left out of the loop: {', '.join(left)}" if left else ""
+    found = _linear(made, at, m, tracked, keyed, step)
+    alone = held(mechanism, period)
+    return LinearLoop(_with_memory(alone, found), np.hstack([found.K, -found.C]), says, alone)
 
 
-def _on_keys(problem: Problem, law: Law, own: Mapping[str, Any], t: float) -> _Point:
+def _on_keys(problem: Problem, law: Law, own: Mapping[str, Any], t: float, period: float) -> _Point:
     clip, _ = aimed(problem.clip, own.get("goal") or {}, "goal")
-    target = Target(*clip.evaluate(t))
-    return _Point(t, target.q, target.v, target, law.start())
+    before, target = (Target(*clip.evaluate(max(0.0, at))) for at in (t - period, t))
+    _, memory = law(t - period, before.q, before.v, before, law.start())
+    return _Point(t, target.q, target.v, target, memory)
 
 
 def _run_to(plan: Plan, law: Law, t: float) -> _Point:
@@ -100,17 +109,30 @@ def _run_to(plan: Plan, law: Law, t: float) -> _Point:
     return _Point(ticks * period, segment.q[-1], segment.v[-1], target, controls.memory)
 
 
-def _gains(law: Law, at: _Point, m: mujoco.MjModel, tracked: Mask, keyed: Mask, step: float) -> Array:
-    def forces(dq: Array, dv: Array) -> Array:
-        tau, _ = law(at.t, moved(m, at.q, dq), at.v + dv, at.target, at.memory)
-        return tau[tracked]
+def _left(words: Mapping[str, Any]) -> tuple[str, ...]:
+    """Words of sensors and drives that are no part of the linear loop."""
+    kept = {"delay"} | ({"observer", "corner"} if words.get("observer") in ("none", "filter") else set())
+    return tuple(word for word in words if word in LOOP_WORDS and word not in kept)
 
-    none, columns = np.zeros(m.nv), []
-    for of_speed in (False, True):
-        for unit in step * np.eye(m.nv)[~keyed]:
-            plus, minus = ((none, s * unit) if of_speed else (s * unit, none) for s in (1.0, -1.0))
-            columns.append((forces(*minus) - forces(*plus)) / (2.0 * step))
-    return np.column_stack(columns)
+
+def _linear(law: Law, at: _Point, m: mujoco.MjModel, tracked: Mask, keyed: Mask, step: float) -> LinearLaw:
+    free, n = ~keyed, int((~keyed).sum())
+
+    def forces(x: Array, memory: Any) -> tuple[Array, Any]:
+        dq, dv = np.zeros(m.nv), np.zeros(m.nv)
+        dq[free], dv[free] = x[:n], x[n:]
+        tau, after = law(at.t, moved(m, at.q, dq), at.v + dv, at.target, memory)
+        return tau[tracked], after
+
+    return linear_law(forces, at.memory, 2 * n, step, dof_names(m))
+
+
+def _with_memory(mechanism: LinearSystem, law: LinearLaw) -> LinearSystem:
+    """x+ = A x + B u beside m+ = G x + M m."""
+    (n, inputs), k = mechanism.B.shape, len(law.names)
+    A = np.block([[mechanism.A, np.zeros((n, k))], [law.G, law.M]])
+    B = np.vstack([mechanism.B, np.zeros((k, inputs))])
+    return LinearSystem(A, B, (*mechanism.states, *law.names), mechanism.inputs, mechanism.period)
 
 
 def _touching(m: mujoco.MjModel, q: Array) -> str:
