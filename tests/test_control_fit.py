@@ -321,6 +321,65 @@ def test_a_battery_bounds_the_sum_of_currents():
     assert (np.abs(tau) @ np.array([0.1, 0.2])).max() <= 9.0 * (1 + 1e-4)
 
 
+@pytest.mark.parametrize("joints", [5, 7])
+def test_a_battery_of_many_joints_is_used_up_everywhere(joints):
+    """One limit alone: the fastest timing draws all of it at nearly every time, by MuJoCo's own forces."""
+    chain = "".join(
+        f'<body pos=".1 0 0"><joint name="j{i}" axis="0 1 0" damping=".01"/><geom size=".03" mass=".1"/>'
+        for i in range(joints)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{chain}{'</body>' * joints}</worldbody></mujoco>"
+    )
+    rng = np.random.default_rng(joints)
+    tracks = {f"j{i}": keyed([0, 1, 2], rng.uniform(-0.5, 0.5, 3)) for i in range(joints)}
+    clip = Clip(model, tracks, model.qpos0)
+    q = clip.evaluate(np.linspace(0, 2, 201)).q
+    still = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    current = 3.0 * 2.0 * np.abs(forces(still, machine(model))).sum(axis=1).max()
+    found = retime(clip, machine(model, ampere=2.0, current=current), points=300)
+    assert found.slowed < 1.01
+    data, draw = mujoco.MjData(model), []
+    for row in zip(*found.clip.evaluate(np.linspace(0, found.duration, 801)[1:-1]), strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = row
+        mujoco.mj_inverse(model, data)
+        draw.append(2.0 * np.abs(data.qfrc_inverse).sum())
+    assert max(draw) <= current * (1 + 1e-4)
+    assert np.mean(np.array(draw) > 0.97 * current) > 0.9
+
+
+RUBBING = mujoco.MjModel.from_xml_string(
+    """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" frictionloss="3"/>
+    <geom size=".1" mass="2"/><body><joint name="arm" axis="0 1 0" frictionloss="6"/>
+    <geom size=".1" mass="0.1" pos=".5 0 0"/></body></body></worldbody></mujoco>"""
+)
+
+
+@given(st.floats(0.1, 2), st.floats(3.2, 20), st.sampled_from([1.0, -1.0]))
+@settings(max_examples=15)
+def test_friction_opposes_the_way_and_helps_to_brake(way, force, sign):
+    """From rest to rest: (force - friction) / m to the switch, (force + friction) / m after it."""
+    clip = Clip(RUBBING, {"x": keyed([0, 1], [0, sign * way], kind="linear")}, RUBBING.qpos0)
+    able = machine(RUBBING, force={"x": force})
+    slow, brake = (force - 3.0) / 2.1, (force + 3.0) / 2.1
+    best = np.sqrt(2.0 * way * (1.0 / slow + 1.0 / brake))
+    found = retime(clip, able, points=400)
+    assert best * (1 - 1e-6) <= found.duration <= best * 1.01
+    shares = check(found.clip, able).uses
+    assert {use.who: use.share for use in shares}["x"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_friction_forbids_and_what_it_holds():
+    """A drive weaker than friction moves nothing; what friction bears at rest needs no drive."""
+    moves = Clip(RUBBING, {"x": keyed([0, 1], [0, 0.01], ease="smooth")}, RUBBING.qpos0)
+    weak = machine(RUBBING, force={"x": 2.5, "arm": 0.1})
+    found = check(moves, weak)
+    assert [v.who for v in found.violations] == ["x"]  # the arm's weight, 0.5 N m, hangs in its friction
+    assert found.worst > 3.0 / 2.5
+    with pytest.raises(PantographError, match="dry friction counted"):
+        retime(moves, weak)
+
+
 def test_pauses_keep_their_length():
     clip = Clip(ARM, {"shoulder": keyed([0, 1, 2, 3], [0, 1, 1, 0], kind="auto")}, ARM.qpos0)
     found = retime(clip, machine(ARM, velocity=50.0, acceleration=200.0, force=np.inf), points=300)

@@ -13,7 +13,7 @@ from ...models import dof_names
 from ...sim.clip import Clip, FreeTrack, Motion, Track
 from ...sim.curves import Curve
 from .contact import Phase, missing
-from .machine import Machine
+from .machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
 MISSING = "missing force"
@@ -251,7 +251,22 @@ def by_piece(machine: Machine, t: Array, clip: Clip) -> Array:
 
 
 def forces(motion: Motion, machine: Machine) -> Array:
-    """Joint forces (n, nv) that rows of motion need."""
+    """Joint forces (n, nv) that rows of motion need, with what overcomes dry friction.
+
+    Friction opposes motion, and where a freedom rests it bears what it can. Where nothing drives a freedom
+    it is that of :data:`~.machine.WIDTH`: no force of a drive is there to make up for a jump.
+    """
+    tau, f = rigid(motion, machine), machine.friction
+    if not f.any():
+        return tau
+    v = motion.v
+    rests = np.abs(v) <= 1e-9 * (1.0 + np.abs(v).max(initial=0.0))
+    sliding = np.where(machine.driven, np.sign(v), v / np.sqrt(v**2 + WIDTH**2))
+    return np.asarray(tau + np.where(rests, -np.clip(tau, -f, f), f * sliding))
+
+
+def rigid(motion: Motion, machine: Machine) -> Array:
+    """Joint forces (n, nv) that rows of motion need but for dry friction."""
     if machine.nominal.compiled:
         return machine.nominal.smooth.inverse(motion.q, motion.v, motion.a)
     return np.array([machine.nominal.inverse(*row) for row in zip(*motion, strict=True)])

@@ -10,13 +10,15 @@ round is feasible and faster than the one before.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ...models import dof_names
 from ...sim.clip import Clip, Motion
 from ...sim.errors import PantographError
-from .check import forces
+from .check import rigid
 from .machine import Machine
 from .path import TURN, Corner, Path, corner
 
@@ -29,6 +31,17 @@ def even(clip: Clip, points: int) -> Array:
     breaks = clip.breaks_between(clip.start, clip.end)
     s = np.union1d(np.linspace(clip.start, clip.end, points + 1), breaks)
     return np.asarray(s[np.append(True, np.diff(s) > 1e-9 * (clip.end - clip.start))])
+
+
+class _Lift(NamedTuple):
+    """Joint forces push u + square x + drag sqrt(x) + weight (n, nv) along a path, dry friction of what moves
+    in ``weight``; what friction may bear of them where a joint rests, ``held``."""
+
+    push: Array
+    square: Array
+    drag: Array
+    weight: Array
+    held: Array
 
 
 class Grid:
@@ -46,16 +59,14 @@ class Grid:
             raise PantographError(f"no timing helps: the path jumps at {self.s[1:-1][gap][0]:.4g} s")
         if along is not None:
             begin, end, self.h, self.pace = along.begin, along.end, along.length, along.rate**2
-        rows0, rows1 = self.rows(begin), self.rows(end)
-        # at the end of a piece x has become x + 2 h u
-        a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
-        self.a, self.b, self.c, self.e = (
-            np.concatenate(pair, axis=1)
-            for pair in ((rows0[0], a1), (rows0[1], rows1[1]), (rows0[2], rows1[2]), (rows0[3], rows1[3]))
-        )
-        self.half = rows0[0].shape[1]
-        self._ease(begin, end)
-        self.curved = bool(np.any(self.e > 0))
+        self.ends = (begin, end)
+        # of the 2^n signs of forces whose sum a battery bounds few matter: those of the weight, and to these
+        # come the ones that a solution has
+        self.signs = np.zeros((0, clip.model.nv))
+        if np.isfinite(machine.current):
+            loaded = np.where(machine.ampere > 0, self._lift(begin).weight, 0.0)
+            self.signs = np.unique(np.sign(loaded), axis=0)
+        self._lay()
         speed = np.maximum(np.abs(begin.v), 1e-150)
         cap0 = np.min((machine.velocity / speed) ** 2, axis=1)
         cap1 = np.min((machine.velocity / np.maximum(np.abs(end.v), 1e-150)) ** 2, axis=1)
@@ -73,6 +84,20 @@ class Grid:
             bool(np.any(np.abs(begin.v[0]) > 1e-9 * top)),
             bool(np.any(np.abs(end.v[-1]) > 1e-9 * top)),
         )
+
+    def _lay(self) -> None:
+        """Rows of all limits at both ends of each piece."""
+        begin, end = self.ends
+        rows0, rows1 = self.rows(begin), self.rows(end)
+        # at the end of a piece x has become x + 2 h u
+        a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
+        self.a, self.b, self.c, self.e = (
+            np.concatenate(pair, axis=1)
+            for pair in ((rows0[0], a1), (rows0[1], rows1[1]), (rows0[2], rows1[2]), (rows0[3], rows1[3]))
+        )
+        self.half = rows0[0].shape[1]
+        self._ease(begin, end)
+        self.curved = bool(np.any(self.e > 0))
 
     def _ease(self, begin: Motion, end: Motion) -> None:
         """Beside a rest that keys ease into x would rise without bound, and not in a straight line: on the
@@ -132,40 +157,67 @@ class Grid:
             add(zero, zero, 1.0)
         return tuple(np.stack(x, axis=1) for x in (a, b, c, e))  # type: ignore[return-value]
 
-    def _force_rows(self, at: Motion, limited: NDArray[np.bool_], add) -> None:  # type: ignore[no-untyped-def]
-        """tau = m u + k x + d sqrt(x) + g, from four inverse dynamics."""
+    def _lift(self, at: Motion) -> _Lift:
+        """What forces are made of at states of the path, from four inverse dynamics."""
         machine, zero = self.machine, np.zeros_like(at.v)
-        weight = forces(Motion(at.q, zero, zero), machine)
-        push = forces(Motion(at.q, zero, at.v), machine) - weight
-        forth = forces(Motion(at.q, at.v, at.a), machine)
-        back = forces(Motion(at.q, -at.v, at.a), machine)
-        square, drag = 0.5 * (forth + back) - weight, 0.5 * (forth - back)
+        weight = rigid(Motion(at.q, zero, zero), machine)
+        push = rigid(Motion(at.q, zero, at.v), machine) - weight
+        forth = rigid(Motion(at.q, at.v, at.a), machine)
+        back = rigid(Motion(at.q, -at.v, at.a), machine)
+        moves = np.abs(at.v) > 1e-9 * np.abs(at.v).max(initial=0.0)
+        held = np.where(moves, 0.0, machine.friction)
+        dry = np.where(moves, machine.friction * np.sign(at.v), 0.0)
+        return _Lift(push, 0.5 * (forth + back) - weight, 0.5 * (forth - back), weight + dry, held)
+
+    def _force_rows(self, at: Motion, limited: NDArray[np.bool_], add) -> None:  # type: ignore[no-untyped-def]
+        machine = self.machine
+        push, square, drag, weight, held = self._lift(at)
         for dof in np.flatnonzero(limited):
             low, high, top = machine.force_low[dof], machine.force_high[dof], machine.top_speed[dof]
-            if (weight[:, dof] > high).any() or (weight[:, dof] < low).any():
-                k = int(np.argmax(np.maximum(weight[:, dof] - high, low - weight[:, dof])))
+            beyond = np.maximum(weight[:, dof] - high, low - weight[:, dof]) - held[:, dof]
+            if (beyond > 0).any():
+                k = int(np.argmax(beyond))
                 joint = machine.model.joint(int(machine.model.dof_jntid[dof])).name
                 raise PantographError(
                     f"no timing helps: joint {joint!r} cannot hold the pose at {self.s[k]:.3f} s, "
                     f"{weight[k, dof]:.4g} N m or N against {high if weight[k, dof] > 0 else low:.4g}"
+                    + (", dry friction counted" if machine.friction[dof] else "")
                 )
             for sign, limit in ((1.0, high), (-1.0, -low)):
                 # a motor loses force only in the direction it moves
-                moves = sign * at.v[:, dof] > 0
-                fall = np.where(moves, limit * np.abs(at.v[:, dof]) / top, 0.0)
+                forth = sign * at.v[:, dof] > 0
+                fall = np.where(forth, limit * np.abs(at.v[:, dof]) / top, 0.0)
                 curve = np.maximum(sign * drag[:, dof] + fall, 0.0)
-                add(sign * push[:, dof], sign * square[:, dof], limit - sign * weight[:, dof], curve)
+                room = limit + held[:, dof] - sign * weight[:, dof]
+                add(sign * push[:, dof], sign * square[:, dof], room, curve)
         if np.isfinite(machine.current):
-            used = np.flatnonzero(machine.ampere > 0)
-            if len(used) > 6:
-                raise PantographError("a battery of more than six joints: give fewer of them an ampere value")
-            for signs in np.array(np.meshgrid(*[[1.0, -1.0]] * len(used))).reshape(len(used), -1).T:
-                w = np.zeros(at.v.shape[1])
-                w[used] = signs * machine.ampere[used]
+            for w in self.signs * machine.ampere:
                 add(push @ w, square @ w, machine.current - weight @ w, np.maximum(drag @ w, 0.0))
+
+    def _unseen(self, x: Array) -> Array:
+        """Signs (k, nv) of forces with which x (n + 1,) draws more than the battery gives, without a row."""
+        machine = self.machine
+        u = (0.5 * np.diff(x) / self.h)[:, None]
+        tau = []
+        for at, y in zip(self.ends, (x[:-1, None], x[1:, None]), strict=True):
+            push, square, drag, weight, _ = self._lift(at)
+            tau.append(push * u + square * y + drag * np.sqrt(y) + weight)
+        every = np.where(machine.ampere > 0, np.concatenate(tau), 0.0)
+        over = every[np.abs(every) @ machine.ampere > machine.current * (1.0 + 1e-9)]
+        new = np.unique(np.sign(over), axis=0)
+        return new[[not (row == self.signs).all(axis=1).any() for row in new]]
 
     def fastest(self, keep: bool, at_rest: tuple[bool, bool]) -> Array:
         """The largest possible x (n + 1,) at the grid's times, with tangents of the last solution's roots."""
+        while True:
+            x = self._settled(keep, at_rest)
+            new = self._unseen(x) if np.isfinite(self.machine.current) else np.zeros((0, 0))
+            if not len(new):
+                return x
+            self.signs = np.vstack([self.signs, new])
+            self._lay()
+
+    def _settled(self, keep: bool, at_rest: tuple[bool, bool]) -> Array:
         x = self.solve(keep, at_rest)
         for _ in range(6 if self.curved else 0):
             better = self.solve(keep, at_rest, about=x)

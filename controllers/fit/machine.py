@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.engines.derive import dry_friction
 from ...sim.errors import PantographError
 from ...sim.kinds import SCALAR
 from ..gains import force_limits, limit_per_joint, per_joint
@@ -16,6 +17,8 @@ from ..nominal import Nominal
 
 Array = NDArray[np.float64]
 Limit = float | Mapping[str, float] | None
+WIDTH = 0.01
+"""Speed w [rad/s, m/s] below which dry friction f is smoothed in programs: f v / sqrt(v^2 + w^2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +29,7 @@ class Machine:
     [rad/s^3, m/s^3]; ``force_low``, ``force_high`` at standstill [N m, N]; ``top_speed``: where a motor gives
     nothing more (its force falls in a straight line); ``current`` [A] of the battery, drawn at ``ampere``
     [A/(N m), A/N] of each joint's force. ``driven`` (nv,): freedoms with a drive; the others take no force.
+    ``friction``: dry friction of the model [N m, N], which opposes motion and holds what rests.
     """
 
     nominal: Nominal
@@ -40,6 +44,7 @@ class Machine:
     ampere: Array
     current: float
     driven: NDArray[np.bool_]
+    friction: Array
 
     @property
     def asks_forces(self) -> bool:
@@ -108,6 +113,7 @@ def machine(
         np.zeros(model.nv) if ampere is None else per_joint(model, "ampere", ampere),
         float(current),
         driven,
+        dry_friction(model),
     )
 
 
