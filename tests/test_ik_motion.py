@@ -179,6 +179,23 @@ def test_a_look_that_slides_along_the_limits_of_ball_joints_is_as_near_as_any_po
     assert np.abs(np.diff(motion.q, axis=0)).max() < 0.5
 
 
+def test_what_goals_leave_open_does_not_drift():
+    """A gaze goes round and round; how far the head is turned about it is nobody's goal."""
+    model, times = load_model("puppet"), np.arange(0, 8, 0.05)
+
+    def goals(t):
+        w = 0.5 * np.pi * t
+        point = [1.0, 0.5 * np.sin(w), 1.0 + 0.4 * np.cos(w)]
+        return [LookAt("gaze", point, axis=(1, 0, 0))]
+
+    motion = follow(model, goals, times, joints=["neck"])
+    assert motion.followed
+    neck = motion.q[:, model.joint("neck").qposadr[0] :][:, :4]
+    roll = 2 * np.arctan2(neck[:, 1], neck[:, 0])
+    assert np.abs(roll).max() < 0.2
+    np.testing.assert_allclose(neck[100], neck[20], atol=0.01)  # the same after a turn
+
+
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_halving_the_tick_halves_the_steps_also_past_singularities(seed):

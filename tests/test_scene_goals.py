@@ -306,7 +306,11 @@ def test_goals_of_equal_names_are_told_apart():
     [
         ({"kind": "lock", "at": "left_foot", "stances": [[0.2, 0.5], [0.4, 0.6]]}, [], "overlap"),
         ({"kind": "lock", "at": "left_foot", "stances": [[0.2, 3]]}, [], "not within the motion"),
-        ({"kind": "spread", "joints": ["waist", "left_elbow"]}, ["waist", "left_elbow"], "different kinds"),
+        (
+            {"kind": "spread", "joints": ["waist", "left_elbow"]},
+            ["waist", "left_elbow"],
+            "only hinges, only slides or only balls",
+        ),
         ({"kind": "joint_value", "joint": "neck", "value": [0]}, ["neck"], "no hinge or slide"),
         (
             {"kind": "posture", "posture": {"neck": [0, 0, 0]}},

@@ -258,7 +258,7 @@ class Follower:
     ) -> tuple[Array, Array, list[str]]:
         """Rows A d <= b that keep geoms apart, for pairs near enough to matter."""
         near = [x for x in zip(here.gaps, allowed, self.names, strict=False) if np.any(x[0].J)]
-        A = np.array([-gap.J[columns] for gap, _, _ in near]).reshape(-1, len(columns))
+        A = np.array([-gap.J[columns] for gap, _, _ in near]).reshape(len(near), len(columns))
         b = np.array([gap.distance - least for gap, least, _ in near])
         return A, b, [name for _, _, name in near]
 

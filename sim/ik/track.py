@@ -24,7 +24,7 @@ from ..errors import ModelError
 from .goals import Goal
 from .numeric.band import Limits, smoothest_step
 from .pose import Kinematics
-from .problem import Problem
+from .problem import Problem, freedom_names
 from .solve import residuals, solve
 from .space import Space
 from .spline import on_curve, smooth_clip, spline_clip
@@ -37,7 +37,9 @@ Goals = Callable[[float], Sequence[Goal]] | Sequence[Sequence[Goal]]
 _TRACKING = 1e-4  # [m or rad] of deviation that costs as much as the reference acceleration
 _REFERENCE = 10.0  # [rad/s^2] where no acceleration limit gives a scale
 _WISHED = 1e-2  # weight of wishes beside hard goals
-_STARTS = 6
+_RESTED = 1.0  # weight of rest beside goals in the first guess, tick by tick
+_RESTING = 0.3  # [1/rad or 1/m] of what goals leave open: a ten-thousandth of a goal's weight and less
+_STARTS, _CLEARLY = 6, 0.5  # seen from the nearest; share of its cost with which another start is taken
 _ROUNDING = 1e-9  # of a limit
 _WALL = 100.0  # weight of the limit of a ball joint beside that of goals
 _SETTLED = 15  # programmes from a motion that is nearly right
@@ -112,7 +114,8 @@ def follow(
     `goals`: a function of time [s] that gives them, or one list of goals an instant, as from a capture.
     `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
     by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
-    `around` (k, nq): motion of the joints that do not move for the goals; default they stay as `q0`.
+    `around` (k, nq): motion of the joints that do not move for the goals; default they stay as `q0`. What
+    the goals leave open stays near `around`, `q0` or `start`, and smooth.
     Raises ModelError for times that are not evenly spaced or goals that do not fit them.
     """
     t = np.asarray(times, dtype=float)
@@ -121,7 +124,8 @@ def follow(
         q0 = np.asarray(around, dtype=float)[0]
     v_max, a_max = limit("velocity", velocity, model.nv), limit("acceleration", acceleration, model.nv)
     bounded = bool(np.isfinite([v_max, a_max]).any())
-    line = _Line(model, goals, t, joints, around, bounded=bounded)
+    rest = next((x for x in (around, q0, start) if x is not None), model.qpos0)
+    line = _Line(model, goals, t, joints, around, rest, bounded=bounded)
     q = _first_guess(line, q0, start, v_max, a_max)
     limits = Limits(line.space, float(t[1] - t[0]), v_max, a_max, start is not None)
     q = _smoothed(line, q, limits, iterations)
@@ -144,7 +148,7 @@ def near_path(
     """Smooth motion (k, nq) along goals, one list an instant t (k,), found from a motion q (k, nq); joints
     that are not named stay as in it."""
     evenly(t)
-    line = _Line(model, goals, t, joints, q, bounded=False)
+    line = _Line(model, goals, t, joints, q, q, bounded=False)
     free = np.full(model.nv, np.inf)
     limits = Limits(line.space, float(t[1] - t[0]), free, free, False)
     return _smoothed(line, line.space.clip(q), limits, _SETTLED)
@@ -160,6 +164,7 @@ class _Line:
         t: Array,
         joints: Sequence[str] | None,
         around: ArrayLike | None,
+        rest: ArrayLike,
         *,
         bounded: bool,
     ):
@@ -176,6 +181,7 @@ class _Line:
         self.around = None if around is None else np.asarray(around, dtype=float)
         if self.around is not None and self.around.shape != (len(t), model.nq):
             raise ModelError(f"the motion around has shape {self.around.shape}, not ({len(t)}, {model.nq})")
+        self.rest = np.broadcast_to(np.asarray(rest, dtype=float), (len(t), model.nq))
         self._ours = self.space.coordinates(self.moved)
 
     def placed(self, k: int, q: Array) -> Array:
@@ -195,12 +201,15 @@ class _Line:
 
     def rows(self, q: Array) -> list[tuple[Array, Array]]:
         """Weighted residuals of every instant and their Jacobians, as if each depended on its own control
-        point alone (three quarters of it do); judged rows count most."""
-        out = []
-        for problem, x in zip(self.problems, self.on_curve(q), strict=True):
+        point alone (three quarters of it do); judged rows count most, the way from rest least."""
+        on, out = self.on_curve(q), []
+        away = _RESTING * self.space.difference(on, self.rest)[:, self.moved]
+        back = _RESTING * np.eye(self.space.nv)[self.moved]
+        for problem, x, d in zip(self.problems, on, away, strict=True):
             w = problem.weighted(problem.raw(x[None]))
             weight = np.where(problem.judged, 1.0, _WISHED) / _TRACKING
-            out.append((w.r[0] * weight, w.J[0] * weight[:, None]))
+            r, J = w.r[0] * weight, w.J[0] * weight[:, None]
+            out.append((np.concatenate([r, d]), np.concatenate([J, back])))
         return out
 
 
@@ -221,7 +230,8 @@ def _walled(space: Space, q: Array, rows: list[tuple[Array, Array]]) -> list[tup
 def _first_guess(
     line: _Line, q0: ArrayLike | None, start: ArrayLike | None, v_max: Array, a_max: Array
 ) -> Array:
-    """The start that differential inverse kinematics follows best, and its motion (k, nq)."""
+    """The nearest start, or one that differential inverse kinematics follows much better, and its motion
+    (k, nq)."""
     model = line.model
     first = line.problems[0]
     if start is not None:
@@ -232,7 +242,7 @@ def _first_guess(
     best: tuple[float, Array] | None = None
     for q in starts:
         path, cost = _streamed(line, q, v_max)
-        if best is None or cost < best[0]:
+        if best is None or cost < _CLEARLY * best[0]:
             best = cost, path
     assert best is not None
     return best[1]
@@ -241,11 +251,12 @@ def _first_guess(
 def _streamed(line: _Line, q: Array, v_max: Array) -> tuple[Array, float]:
     """Motion (k, nq) by one tick after the other, and its sum of squared deviations and accelerations."""
     dt = float(line.t[1] - line.t[0])
-    follower = Follower(line.model, dt=dt, q0=q, velocity=v_max, joints=line.joints)
+    names = freedom_names(line.model, line.moved)
+    follower = Follower(line.model, dt=dt, q0=q, velocity=v_max, joints=names)
     out, cost = [q], 0.0
     for k, problem in enumerate(line.problems[1:], start=1):
         follower.q = line.placed(k, follower.q)
-        tick = follower.step(problem.goals)
+        tick = follower.step([*problem.goals, Posture(line.rest[k], weight=_RESTED)])
         w = problem.weighted(problem.raw(tick.q[None]))
         cost += float(np.sum(w.r**2)) / _TRACKING**2
         out.append(tick.q)
