@@ -195,20 +195,27 @@ def test_computed_torque_gives_tracked_joints_their_acceleration_beside_passive_
 # ---- operational space and impedance
 
 
+@pytest.mark.parametrize("keyed", [(), (0,), (1, 4)])
 @pytest.mark.parametrize("axes", ["position", "pose"])
-def test_operational_space_gives_the_site_its_acceleration_whatever_the_posture(axes):
+def test_operational_space_gives_the_site_its_acceleration_whatever_the_posture(axes, keyed):
+    """Also beside joints that move as keyed, as far as those that are left can."""
     model, rng = load_model("arm6"), np.random.default_rng(3)
+    if keyed and axes == "pose":
+        return  # five joints do not turn and move a body as they like
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    tracked = np.ones(6, dtype=bool)
+    held = np.isin(np.arange(6), keyed)
     nominal, task = Nominal(model), Task(model, "tip", axes)
     for posture in (0.5, 3.0):
         law = OperationalSpace(
-            model, tracked, model.qpos0, site="tip", axes=axes, frequency=2.0, posture=posture
+            model, ~held, model.qpos0, held, site="tip", axes=axes, frequency=2.0, posture=posture
         )
         q, v = np.array([0.3, 0.35, 0.15, 0.2, 1.05, 0.1]), 0.3 * rng.normal(size=6)
         target = Target(q + 0.05 * rng.normal(size=6), rng.normal(size=6), rng.normal(size=6))
+        target = Target(*(np.where(held, now, x) for now, x in zip((q, v, target.a), target, strict=True)))
         tau, _ = law(0.0, q, v, target, None)
-        a = nominal.smooth.forward(q, v, tau=tau)
+        M, h = nominal.mass_matrix(q), nominal.inverse(q, v, np.where(held, target.a, 0.0))
+        a = target.a.copy()
+        a[~held] = np.linalg.solve(M[np.ix_(~held, ~held)], (tau - h)[~held])
         now, wanted = task.at(q, v), task.at(target.q, target.v)
         w = 2 * np.pi * 2.0
         expected = wanted.J @ target.a + wanted.drift + w**2 * task.error(now, wanted)
@@ -371,6 +378,19 @@ def test_play_loses_no_impulse(seed, speed):
         gap = rotors.q[0] - (at[0] + 0.01 * speed)
         assert abs(gap) <= 0.05 + 1e-9
         assert put == pytest.approx(got + model.dof_armature[0] * (rotors.v[0] - speed), abs=1e-9)
+
+
+def test_a_flank_pushes_and_does_not_pull():
+    """A rotor that runs into its flank against its motor gives its momentum, turns round, and gives nothing
+    more."""
+    play, still = geared(0.1, 0.02, 0.01)[0], np.zeros(2)
+    rotors = Rotors(np.array([0.05 - 1e-3, 0.0]), np.array([1.0, 0.0]))
+    tau = np.array([-0.5, 0.0])
+    hit = 2e-3 / (1.0 + np.sqrt(1.0 - 2 * 25.0 * 1e-3))  # 1e-3 = t - 25 t^2 / 2
+    given_, after = play.pass_on(tau, still, still, rotors)
+    assert given_[0] == pytest.approx(0.02 * (1.0 - 25.0 * hit) / 0.01, rel=1e-9)
+    assert after.q[0] == pytest.approx(0.05 - 12.5 * (0.01 - hit) ** 2, rel=1e-9)
+    assert play.pass_on(tau, still, still, after)[0][0] == 0.0
 
 
 def test_dry_friction_stops_and_does_not_shake():
