@@ -6,7 +6,7 @@ from .contact import Phase
 from .fitted import Certificate, Fitted
 from .machine import Machine, machine
 from .prove import Proof, prove
-from .retime import Retimed, retime
+from .retime import Retimed, Stop, retime
 
 __all__ = [
     "Certificate",
@@ -16,6 +16,7 @@ __all__ = [
     "Proof",
     "Report",
     "Retimed",
+    "Stop",
     "Violation",
     "check",
     "fit",
