@@ -345,6 +345,28 @@ def test_divergence_keeps_finite_samples(tmp_path):
     assert 0 < len(segment.t) < 500
 
 
+WHIP = """
+<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="a" axis="0 1 0" range="-1 1"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5"/>
+  <body pos="0 0 -.5"><joint name="b" axis="0 1 0" range="-2 2"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5"/>
+    <body pos="0 0 -.5"><joint name="c" axis="0 1 0" range="-2 2"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5"/></body></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("restitution", "step", "fast"), [(0.0, 0.02, 3), (0.0, 0.1, 4), (0.9, 0.1, 5)])
+def test_a_state_that_blows_up_on_its_way_to_a_limit_has_diverged(tmp_path, restitution, step, fast):
+    physics = {"contacts": "none", "restitution": restitution}
+    start = {"a": 30.0 * fast, "b": -400.0 * fast, "c": 1e3 * fast}
+    solver = {"engine": "smooth", "step": step, "integrator": "rk4"}
+    words = {"initial": {"position": {"a": 0.3}, "velocity": start}, "physics": physics, "solver": solver}
+    r = run(scene_of(tmp_path, WHIP, duration=5.0, **words))
+    assert r.status == "diverged"
+    assert "too fast or too stiff" in r.message
+    assert np.isfinite(r.q).all()
+
+
 def test_a_joint_that_nothing_pushes_lies_on_its_limit_without_chatter(tmp_path):
     """On its bound, weightless, at rest: rounding alone must not make it meet and leave the limit."""
     xml = """

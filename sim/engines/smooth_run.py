@@ -40,6 +40,10 @@ class Moment(NamedTuple):
     met: bool
 
 
+class _Diverged(Exception):
+    """The state makes no sense any more, why is the message."""
+
+
 class Run(ABC):
     """State of one run: the whole model's q, v, act at `offset` seconds after its start."""
 
@@ -73,6 +77,9 @@ class Run(ABC):
                     import scipy.optimize  # noqa: F401  # takes its time when it is needed first
             message = self.advance(progress)
             status = "diverged" if message else "done"
+        except _Diverged as why:
+            status, message = "diverged", str(why)
+            self._keep_last()
         except KeyboardInterrupt:
             status, message = "interrupted", f"interrupted at t = {self._keep_last():.4g} s"
         except Exception as error:
@@ -143,12 +150,15 @@ class Run(ABC):
         self.samples.append((self.t0 + offset, State(q.copy(), v.copy(), act.copy())))
 
     def roll(self, length: float) -> tuple[Array, Array, Array]:
-        """The state one step of ``length`` seconds later."""
+        """The state one step of ``length`` seconds later; what looks for events in it needs it to be sane."""
         c = self.model()
         w = c.prescribed(np.array([self.offset]), length)
         x = c.stepper(c.gather(self.q, self.v, self.act), c.held(self.held), 1, length, w)
         self.evaluations += c.stepper.stages
-        return c.spread(x[-1], c.at(np.array([self.offset + length]))[0])
+        state = c.spread(x[-1], c.at(np.array([self.offset + length]))[0])
+        if message := self._nonsense(*state[:2]):
+            raise _Diverged(message)
+        return state
 
     def first_event(self, length: float) -> Moment | None:
         """What happens first within one step of ``length`` seconds from here."""
@@ -298,11 +308,14 @@ class Run(ABC):
 
     def nonsense(self) -> str:
         """Why the state makes no sense, or an empty string."""
-        joint = fastest_joint(self.problem.model, self.q, self.v)
+        return self._nonsense(self.q, self.v)
+
+    def _nonsense(self, q: Array, v: Array) -> str:
+        joint = fastest_joint(self.problem.model, q, v)
         if joint is None:
             return ""
         return (
-            f"diverged before t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
+            f"diverged near t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
             f"{self.pace} the motion is too fast or too stiff; try a smaller step, or check forces and "
             "initial state"
         )
