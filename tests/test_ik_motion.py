@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from oracles import ik_cases
 from oracles.ik_motions import figure_eight, wrist_arm
@@ -241,6 +241,7 @@ def test_streaming_never_breaks_a_limit_whatever_is_asked(seed):
 
 @settings(max_examples=15, deadline=None)
 @given(seeds)
+@example(139)  # so far that full steps towards it do not help
 def test_a_goal_that_jumps_is_reached_in_nearly_the_least_time_and_without_overshoot(seed):
     """Least time of one joint over a way s: a triangle of velocity, or a trapezoid when v_max is reached."""
     rng = np.random.default_rng(seed)

@@ -109,6 +109,7 @@ class Follower:
             None  # (nq,) configuration that meets the last goals, and its velocity (nv,)
         )
         self._aim_v: Array = np.zeros(model.nv)
+        self._aim_damping = _LEAST * _HARD  # kept where no step of a tick helped
         self.v_max, self.a_max = (
             limit("velocity", velocity, model.nv),
             limit("acceleration", acceleration, model.nv),
@@ -224,7 +225,7 @@ class Follower:
         last = self._aim
         aim = self.q if last is None else np.where(self.space.coordinates(problem.moved), last, self.q)
         weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
-        w, damping = problem.weighted(problem.raw(aim[None])), _LEAST * _HARD
+        w, damping = problem.weighted(problem.raw(aim[None])), self._aim_damping
         for _ in range(_ITERATIONS):
             r, J = w.r[0] * weight, w.J[0] * weight[:, None]
             cost, slope = float(r @ r), J.T @ r
@@ -237,8 +238,9 @@ class Follower:
             trial = self.space.step(aim[None], np.clip(d, -_STRIDE, _STRIDE)[None])[0]
             w_trial = problem.weighted(problem.raw(trial[None]))
             better = float(np.sum((w_trial.r[0] * weight) ** 2)) < cost
-            damping = max(damping * (0.1 if better else 100.0), _LEAST * _HARD)
+            damping = min(max(damping * (0.1 if better else 100.0), _LEAST * _HARD), 1e2 * _HARD)
             aim, w = (trial, w_trial) if better else (aim, w)
+        self._aim_damping = damping
         moved: Array = np.zeros(self.model.nv)
         if last is not None:
             moved = self.space.difference(aim[None], last[None])[0] / self.dt * problem.moved
