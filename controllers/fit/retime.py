@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...models import dof_names
-from ...sim.clip import Clip, FreeTrack, Track
+from ...sim.clip import Clip, FreeTrack, Motion, Track
 from ...sim.curves import Curve
 from ...sim.errors import PantographError
-from .check import Report, Violation, by_piece, follow, report
+from .check import Report, Trace, Violation, by_piece, follow, report
 from .grid import Grid, even
 from .machine import Machine
 from .path import Corner, uneven
@@ -44,11 +45,20 @@ class RetimedCurve(Curve):
         rate, bend = self.rate[i] + self.bend[i] * s, self.bend[i]
         # rounding must not carry the end of a piece over a break of the curve below, nor onto its other side
         at = np.clip(self.s[i] + (self.rate[i] + 0.5 * self.bend[i] * s) * s, self.s[i], self.s[i + 1])
-        late = at > 0.5 * (self.s[i] + self.s[i + 1])
-        q, v, a = np.empty((len(at), self.dim)), *np.empty((2, len(at), self.dof))
-        for side, left in ((~late, False), (late, True)):
-            q[side], v[side], a[side] = self.base(at[side], left=left)
+        q, v, a = self.base(at)
+        late = self._ends_at_knots[i] & (at > 0.5 * (self.s[i] + self.s[i + 1]))
+        if late.any():
+            q[late], v[late], a[late] = self.base(at[late], left=True)
         return q, v * rate[:, None], v * bend[:, None] + a * (rate**2)[:, None]
+
+    @cached_property
+    def _ends_at_knots(self) -> NDArray[np.bool_]:
+        """Pieces (n,) that end at a knot of the curve below, or near one."""
+        knots, ends = self.base.knots, self.s[1:]
+        after = np.searchsorted(knots, ends)
+        near = [knots[np.clip(k, 0, len(knots) - 1)] for k in (after - 1, after)]
+        apart = np.abs(near - ends).min(axis=0)
+        return np.asarray(apart <= 1e-9 * (1.0 + np.abs(ends)))
 
 
 class Stop(NamedTuple):
@@ -142,9 +152,10 @@ def _slowed(
 ) -> Retimed:
     """The clip ``at`` the least slowdown with which it holds on a grid ten times finer."""
     low, slow, high, exact = 1.0, 1.0, np.inf, False
+    t, clip = at(1.0)
+    trace = follow(clip, t, jerk=machine.asks_jerk)
     for _ in range(40):
-        t, clip = at(slow)
-        found = report(follow(clip, t, jerk=machine.asks_jerk), machine, keyed=clip.dofs)
+        found = report(_at_pace(trace, slow), machine, keyed=clip.dofs)
         over = [v for v in found.violations if v.kind != "position"]
         if max((v.share for v in over), default=0.0) <= 1.0 + _TIGHT:
             if exact or slow <= low * (1.0 + _ENOUGH):
@@ -161,8 +172,15 @@ def _slowed(
     out_of_range = [v for v in found.violations if v.kind == "position"]
     if out_of_range and out_of_range[0].value > 1e-9:
         raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
+    t, clip = at(slow)
     stops = tuple(Stop(c.s, float(np.interp(c.s, s, t)), c.why) for c in corners if c.why)
     return Retimed(clip, float(t[-1]), found, s, t, stops, slow)
+
+
+def _at_pace(trace: Trace, slow: float) -> Trace:
+    """The same motion, so many times as long."""
+    (q, v, a), jerk = trace.motion, trace.jerk
+    return Trace(trace.t * slow, Motion(q, v / slow, a / slow**2), None if jerk is None else jerk / slow**3)
 
 
 def _slowdown(v: Violation) -> float:
