@@ -10,6 +10,8 @@ import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -17,6 +19,22 @@ from ..sim.errors import PantographError
 
 console = Console()
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked joints.")]
+
+
+def _list_laws(wanted: bool) -> None:
+    """Print every law with its words, and what sensors and drives can be told."""
+    if not wanted:
+        return
+    from .listing import laws
+
+    for entry in laws():
+        console.print(f"[bold]{entry.name}[/]: {escape(entry.says)}\n", highlight=False)
+        console.print(Padding(escape(entry.about), (0, 0, 0, 4)), highlight=False)
+        words = _columns("word", "default", "unit")
+        for word in entry.words:
+            words.add_row(*map(escape, word))
+        console.print(Padding(words, (0, 0, 1, 4)))
+    raise typer.Exit
 
 
 def control(
@@ -39,6 +57,9 @@ def control(
     processes: Annotated[int | None, typer.Option(help="Processes; default: all processors.", min=1)] = None,
     table: Annotated[str, typer.Option(help="Kind of the saved tables: csv or parquet.")] = "csv",
     out: Annotated[Path, typer.Option(help="Folder for tables and picture.")] = Path("out"),
+    laws: Annotated[
+        bool, typer.Option("--laws", is_eager=True, callback=_list_laws, help="List laws and their words.")
+    ] = False,
 ) -> None:
     """Run a scene under several control laws, as modelled and disturbed, and compare them."""
     from ..sim.compose import LAWS
@@ -49,17 +70,17 @@ def control(
     tables.check_format(table)
     loaded = load_scene(scene)
     own = loaded.controller.law if loaded.controller else "pd"
-    laws = [law.strip() for law in compare.split(",") if law.strip()] or [own]
+    chosen = [law.strip() for law in compare.split(",") if law.strip()] or [own]
     known = sorted((*LAWS, ILC))
-    if unknown := [law for law in laws if law not in known]:
+    if unknown := [law for law in chosen if law not in known]:
         raise PantographError(f"no law {unknown[0]!r}; there is: {', '.join(known)}")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"controlling {scene.stem}", total=None)
         result = experiments.compare(
             loaded,
-            laws,
-            sweep=dict(_values(text) for text in sweep or []),
+            chosen,
+            sweep=_swept(sweep or []),
             trials=trials,
             mass=mass,
             push=push,
@@ -86,6 +107,15 @@ def control(
         console.print(f"picture: {path}", soft_wrap=True)
 
 
+def _swept(texts: list[str]) -> dict[str, list[Any]]:
+    """Values of every parameter; what is given for one in several places belongs together."""
+    out: dict[str, list[Any]] = {}
+    for word, values in map(_values, texts):
+        own = out.setdefault(word, [])
+        own += [value for value in values if value not in own]
+    return out
+
+
 def _values(text: str) -> tuple[str, list[Any]]:
     """A parameter and its values from ``word=a,b,c``; numbers where they are numbers."""
     word, sign, rest = text.partition("=")
@@ -108,8 +138,10 @@ def _tables(result: Any) -> tuple[Table, Table]:
     count = len(result.disturbances)
     well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
     well.title = f"tracked joints: errors (rad, m), settling (s); worst of {count} disturbed runs"
-    cost = _columns("law", "effort", "work J", "at limit", "build ms", "tick us", "99 % us", "of T")
-    cost.title = f"what it takes; processor time of ticks, period T = {result.period * 1e3:g} ms"
+    cost = _columns(
+        "law", "effort", "work J", "at limit", "build ms", "tick us", "99 % us", "of T", "longest us"
+    )
+    cost.title = "what it takes; processor time of ticks, 99 % of them in that part of the period T"
     for row in result.rows:
         f, name = row.nominal, row.variant.name
         settled = (
@@ -127,7 +159,8 @@ def _tables(result: Any) -> tuple[Table, Table]:
             f"{f.build * 1e3:.3g}",
             f"{f.tick * 1e6:.0f}",
             f"{f.tick99 * 1e6:.0f}",
-            f"{f.tick99 / result.period:.1%}",
+            f"{f.tick99 / row.period:.1%}",
+            f"{f.longest * 1e6:.0f}",
         )
     return well, cost
 
@@ -147,7 +180,7 @@ def _failures(result: Any, most: int = 8) -> list[str]:
 def _columns(*heads: str) -> Table:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for head in heads:
-        if head in ("law", "joint"):
+        if head in ("law", "joint", "word", "unit"):
             table.add_column(head, overflow="fold")
         else:
             table.add_column(head, justify="right", no_wrap=True)

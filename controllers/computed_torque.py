@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 class ComputedTorque:
-    """Inverse dynamics on the freedoms ``tracked`` (nv,); ``moving`` (nv,) are all that physics moves.
+    """Inverse dynamics on the freedoms ``tracked`` (nv,); ``keyed`` ones (nv,) move as their keys say.
 
     The closed loop has ``frequency`` [Hz] and ``damping``, its poles placed in discrete time for a force held
     over ``period`` [s], so that any frequency is stable. The force is that of the middle of the period, where

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from itertools import product
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +22,8 @@ from ..sim.engines.interface import Role
 from ..sim.errors import PantographError
 from ..sim.plan import Plan, make_plan
 from ..sim.scene.schema import Scene
-from .gains import force_limits
+from ..sim.scene.schema.scene import ControllerItem
+from .gains import force_limits, positive
 from .nominal import Nominal
 from .reality import LOOP_WORDS
 from .trial import ILC, ILC_WORDS, Disturbance, Figures, Trial, run_trial
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 _TASK_WORDS = ("goal", "site", "axes")  # parameters that say what to do, not how
+_PERIOD = "period"  # no parameter of a law: the controller's own
 
 
 @dataclass(frozen=True)
@@ -40,14 +44,21 @@ class Variant:
     words: Mapping[str, Any]
     name: str
 
+    @property
+    def own(self) -> dict[str, Any]:
+        """Parameters of the law itself."""
+        return {word: value for word, value in self.words.items() if word != _PERIOD}
+
 
 @dataclass(frozen=True)
 class Row:
-    """One variant: figures of the undisturbed run, ``nominal``, and of the ``disturbed`` ones in order."""
+    """One variant: figures of the undisturbed run, ``nominal``, and of the ``disturbed`` ones in order, and
+    the ``period`` [s] of its samples."""
 
     variant: Variant
     nominal: Figures
     disturbed: tuple[Figures, ...]
+    period: float
 
     @property
     def failed(self) -> int:
@@ -87,13 +98,16 @@ def compare(
     A disturbed machine has its masses changed by up to the part ``mass``, each body's on its own, and joint
     forces of up to ``push`` of what its drives can give (or of its weight, of ideal drives) for a tenth of
     the scene. ``sweep`` gives lists of parameter values: for every law, each combination of those that it
-    has is a variant. The scene's own
-    controller parameters go to its own law, to the others those that say what to do (a goal, a site) and
-    those of sensors and drives. The law "ilc" is the scene's own, or ``of``, after ``repeats`` runs from
-    which it learned: on each machine anew, before it is pushed. Undisturbed runs are timed one after the
-    other, those of a sweep and disturbed ones share the processors. Raises SceneError for laws and parameters
-    that do not fit.
+    has is a variant; "period" [s] is the controller's own. The scene's own controller parameters go to its
+    own law, to the others those that say what to do (a goal, a site) and those of sensors and drives. The law
+    "ilc" is the scene's own, or ``of``, after ``repeats`` runs from which it learned: on each machine anew,
+    before it is pushed. Undisturbed runs are timed one after the other, those of a sweep and disturbed ones
+    share the processors. Raises SceneError for laws and parameters that do not fit. A script that asks for
+    several processes needs ``if __name__ == "__main__":``; without, a warning says so and one process does it
+    all.
     """
+    if getattr(current_process(), "_inheriting", False):  # as multiprocessing itself asks
+        raise PantographError(_GUARD)
     plan = _plan(scene)
     variants = _variants(scene, laws, sweep or {})
     disturbances = tuple(_disturbances(plan, trials, mass, push, seed))
@@ -109,7 +123,7 @@ def compare(
     found: dict[tuple[int, int], Trial] = {}
     if not sweep:
         for i, variant in enumerate(variants):
-            found[i, 0] = run_trial(plan, variant.law, variant.words, Disturbance())
+            found[i, 0] = run_trial(plan, variant.law, variant.own, Disturbance())
             tell()
     cases = (Disturbance(), *disturbances)
     jobs = [job for job in product(range(len(variants)), range(len(cases))) if job not in found]
@@ -117,7 +131,12 @@ def compare(
         found[job] = trial
         tell()
     rows = tuple(
-        Row(v, found[i, 0].figures, tuple(found[i, j].figures for j in range(1, len(cases))))
+        Row(
+            v,
+            found[i, 0].figures,
+            tuple(found[i, j].figures for j in range(1, len(cases))),
+            v.words.get(_PERIOD, plan.period),
+        )
         for i, v in enumerate(variants)
     )
     assert plan.period is not None
@@ -177,7 +196,13 @@ def learning(comparison: Comparison) -> Figure:
     return chart
 
 
-def _plan(scene: Scene) -> Plan:
+def _plan(scene: Scene, words: Mapping[str, Any] | None = None) -> Plan:
+    """The plan of a scene, with another period where ``words`` say so."""
+    if words and _PERIOD in words:
+        item, base = scene.controller or ControllerItem(), scene._base
+        period = positive("period", words[_PERIOD])
+        scene = scene.model_copy(update={"controller": item.model_copy(update={"period": period})})
+        scene._base = base
     plan = make_plan(scene)
     if plan.period is None:
         raise PantographError(
@@ -189,18 +214,19 @@ def _plan(scene: Scene) -> Plan:
 def _variants(scene: Scene, laws: Sequence[str], sweep: Mapping[str, Sequence[Any]]) -> list[Variant]:
     out: list[Variant] = []
     for word in sweep:
-        if not any(word in _words_of(law, _base(scene)) for law in laws):
+        if word != _PERIOD and not any(word in _words_of(law, _base(scene)) for law in laws):
             _check(laws[0], _base(scene), {word: None})
     for law in laws:
         words = _told(scene, _base(scene) if law == ILC else law) | (
             {"of": _base(scene)} if law == ILC else {}
         )
-        known = {word: values for word, values in sweep.items() if word in _words_of(law, _base(scene))}
+        able = (_PERIOD, *_words_of(law, _base(scene)))
+        known = {word: values for word, values in sweep.items() if word in able}
         for values in product(*known.values()):
             chosen = dict(zip(known, values, strict=True))
             label = " ".join([law, *(f"{k}={v}" for k, v in chosen.items())])
-            _check(law, _base(scene), words | chosen)
             out.append(Variant(law, words | chosen, label))
+            _check(law, _base(scene), out[-1].own)
     return out
 
 
@@ -256,26 +282,36 @@ def _spread(
     processes: int,
 ) -> Iterator[tuple[tuple[int, int], Trial]]:
     """Pairs (job, trial) as they are done, by several processes; with samples where nothing disturbs."""
-    if processes == 1 or len(jobs) < 2:
-        plan = _plan(scene)
-        for i, j in jobs:
-            yield (i, j), run_trial(plan, variants[i].law, variants[i].words, cases[j])
-        return
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=get_context("spawn")) as pool:
-        pending = {pool.submit(_remote, scene, scene._base, variants[i], cases[j]): (i, j) for i, j in jobs}
-        for done in as_completed(pending):
-            yield pending[done], done.result()
+    left = list(jobs)
+    if processes > 1 and len(jobs) > 1:
+        try:
+            with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=get_context("spawn")) as pool:
+                pending = {
+                    pool.submit(_remote, scene, scene._base, variants[i], cases[j]): (i, j) for i, j in jobs
+                }
+                for done in as_completed(pending):
+                    trial = done.result()
+                    left.remove(pending[done])
+                    yield pending[done], trial
+        except BrokenProcessPool:
+            warnings.warn(f"processes ended before they began; one goes on alone: {_GUARD}", stacklevel=3)
+    for i, j in left:
+        yield (i, j), run_trial(_plan(scene, variants[i].words), variants[i].law, variants[i].own, cases[j])
 
 
+_GUARD = (
+    'processes import the script that starts them: put what it does under if __name__ == "__main__":, or ask '
+    "for processes=1"
+)
 _PLANS: dict[str, Plan] = {}
 _NONE = np.zeros(0)
 
 
 def _remote(scene: Scene, base: Path | None, variant: Variant, disturbance: Disturbance) -> Trial:
     """One run in a process of its own, which keeps the plan for the next one."""
-    key = scene.model_dump_json()
+    key = f"{variant.words.get(_PERIOD)} {scene.model_dump_json()}"
     if key not in _PLANS:
         scene._base = base
-        _PLANS[key] = _plan(scene)
-    trial = run_trial(_PLANS[key], variant.law, variant.words, disturbance)
+        _PLANS[key] = _plan(scene, variant.words)
+    trial = run_trial(_PLANS[key], variant.law, variant.own, disturbance)
     return trial if disturbance == Disturbance() else replace(trial, t=_NONE, error=_NONE, tau=_NONE)

@@ -32,8 +32,9 @@ class PIDMemory(NamedTuple):
 class PID:
     """PID on the degrees of freedom ``tracked`` (nv,) of ``model``.
 
-    Gains follow from ``frequency`` [Hz] and ``damping`` as for PD, Ki = Kp w / 10; or ``kp``, ``ki``, ``kd``
-    are given (one number, or one a joint by name). ``filter`` [Hz] is the corner of the velocity filter
+    Gains follow from ``frequency`` [Hz] and ``damping`` as for PD, Ki = Kp w / 10; or ``kp`` [N m/rad,
+    N/m], ``ki`` [N m/(rad s), N/(m s)], ``kd`` [N m s/rad, N s/m] are given (one number, or one a joint by
+    name). ``filter`` [Hz] is the corner of the velocity filter
     (default: ten times ``frequency``). ``feedforward``: nothing, the weight at the target, or all forces that
     the target's motion needs. Beyond what its drives can give, less towards ``top_speed`` [rad/s, m/s], the
     integral runs back within ``windup`` [s] (default: the geometric mean of Ki/Kp and Kd/Kp times).

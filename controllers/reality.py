@@ -48,8 +48,8 @@ class Loop:
       does not know being about ``push`` [rad/s^2, m/s^2]. It knows what motors were told to give, not what
       play and friction leave of it; joints ``keyed`` (nv,) are known to be where their keys say;
     - ``delay`` [s]: forces take effect that much later, rounded up to whole periods;
-    - ``saturation``, ``top_speed`` [rad/s, m/s]: what motors give, see
-      :class:`~pantograph.controllers.drives.Drives`;
+    - ``saturation``: forces are cut at this fraction of what the drives can give;
+    - ``top_speed`` [rad/s, m/s]: motor force falls linearly to zero at this joint speed;
     - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
       :class:`~pantograph.controllers.play.Play`;
     - ``learned``: file of forces that :mod:`~pantograph.controllers.ilc` has learned, added to the law's;

@@ -20,7 +20,7 @@ def summary(comparison: Comparison) -> list[dict[str, Any]]:
     out = []
     for row in comparison.rows:
         spread = {"disturbed": len(row.disturbed), "failed": row.failed, "worst_rms": row.robust}
-        share = {"period": comparison.period, "tick99_of_period": row.nominal.tick99 / comparison.period}
+        share = {"period": row.period, "tick99_of_period": row.nominal.tick99 / row.period}
         out.append(_head(comparison, row.variant) | asdict(row.nominal) | share | spread)
     return out
 

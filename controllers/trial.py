@@ -54,7 +54,8 @@ class Figures:
     motion, or, where it has none, of the largest motion of its kind (infinite: it does not; NaN: the keys
     move until the end, or no joint has anything to do); ``overshoot`` beyond the last key, of the motion;
     ``build`` [s]: what it took to make the law and a first sample; ``tick``, ``tick99`` [s]: median and 99th
-    percentile of the law's processor time a sample after that; ``status`` of the run, and why it ended early.
+    percentile of the law's processor time a sample after that, ``longest`` its longest; ``status`` of the
+    run, and why it ended early.
     """
 
     rms: float
@@ -67,6 +68,7 @@ class Figures:
     build: float
     tick: float
     tick99: float
+    longest: float
     status: str
     message: str
 
@@ -213,6 +215,7 @@ def _measured(problem: Problem, seen: list[_Sample], build: float, status: str, 
         build=build,
         tick=float(np.median(seconds)),
         tick99=float(np.percentile(seconds, 99)),
+        longest=float(seconds.max()),
         status=status,
         message=message,
     )

@@ -29,7 +29,7 @@ PENDULUM = {
     ],
     "controller": {"law": "pd", "period": 0.002, "frequency": 3.0},
 }
-TIMES = ("build", "tick", "tick99")
+TIMES = ("build", "tick", "tick99", "longest")
 
 
 def without_times(figures):

@@ -248,9 +248,12 @@ def report(
 @app.command(epilog="Example: pantograph schema > scene.schema.json")
 def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
+    from ..compose import LAWS
     from ..scene.schema import Scene
 
-    typer.echo(json.dumps(Scene.model_json_schema(), indent=2))
+    made = Scene.model_json_schema()
+    made["$defs"]["ControllerItem"]["properties"]["law"]["enum"] = list(LAWS)
+    typer.echo(json.dumps(made, indent=2))
 
 
 app.add_typer(servo)
