@@ -115,22 +115,89 @@ def test_jerk_and_acceleration_are_bounded():
     clip = move(ARM, "shoulder", [0, 0.5, 1.5], [0.0, 0.8, 0.8], elbow=[0, 0, 0])
     able = machine(ARM, acceleration=5.0, jerk=60.0, force=1e4)
     found = fit(clip, able, hard=[1.5])
+    assert found.certificate.holds
     t = np.linspace(0, 1.5, 3001)
     a = found.clip.evaluate(t[:-1]).a  # held from the last key on
-    assert np.abs(a).max() <= 5.0 * (1 + 5e-3)
-    assert np.abs(np.diff(a, axis=0)).max() / (t[1] - t[0]) <= 60.0 * 1.6  # between nodes a quintic may bend
+    assert np.abs(a).max() <= 5.0 * (1 + 1e-3)
+    assert np.abs(np.diff(a, axis=0)).max() / (t[1] - t[0]) <= 60.0 * 1.002
 
 
 def test_an_acrobot_swings_up_without_a_motor_in_its_shoulder():
     clip = move(ACROBOT, "shoulder", [0, 4.0], [0.0, np.pi], elbow=[0.0, 0.0])
     able = machine(ACROBOT, driven=np.array([False, True]), force={"elbow": 15.0})
-    found = fit(clip, able, hard=[4.0], step=0.05, deviation=0.1, refine=2)
-    assert found.certificate.dynamics < 0.05
+    found = fit(clip, able, hard=[4.0], step=0.05, deviation=0.1)
+    assert found.certificate.holds
     assert np.abs(found.tau[:, 0]).max() == 0.0
     assert np.abs(found.tau[:, 1]).max() <= 15.0
     proof = prove(found, able)
     assert proof.worst < 0.05
     assert abs(proof.q[-1, 0] - np.pi) < 0.05
+
+
+THROWER = mujoco.MjModel.from_xml_string(
+    """<mujoco><worldbody><geom type="plane" size="3 3 .1"/>
+    <body name="ball" pos="0 0 1"><freejoint name="root"/><geom size=".1" mass="1"/>
+      <body><joint name="arm" axis="0 1 0"/><geom size=".05" mass=".1" pos="0 0 -.3"/></body></body>
+    <body name="box" pos="1 0 .1"><freejoint name="box"/><geom type="box" size=".1 .1 .1"/></body>
+    <body name="slider" pos="0 1 0"><joint name="x" type="slide" axis="1 0 0" frictionloss="4"/>
+      <geom size=".1" mass="2" contype="0" conaffinity="0"/>
+      <body><joint name="rope" axis="0 1 0" frictionloss=".02"/>
+        <geom size=".05" mass=".2" pos="0 0 -.3" contype="0" conaffinity="0"/></body></body>
+    </worldbody></mujoco>"""
+)
+LOOSE = np.isin(THROWER.dof_jntid, [THROWER.joint(n).id for n in ("root", "box", "rope")])
+
+
+def test_a_throw_flies_at_the_speed_that_it_needs():
+    """Keys of a body in free flight: its mass centre is on the parabola through both hard poses."""
+    way = keyed([0, 1], [[0, 0, 1], [1, 0, 1]], kind="linear")
+    clip = Clip(THROWER, {"root": FreeTrack(way), "arm": keyed([0, 1], [0, 0], kind="linear")})
+    found = fit(clip, machine(THROWER, driven=~LOOSE), hard=[1.0], at_rest=False)
+    assert found.certificate.holds
+    s = np.linspace(0, 1, 101)
+    q = found.clip.evaluate(s, left=True).q
+    data, heights = mujoco.MjData(THROWER), []
+    for row in q:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(THROWER, data)
+        mujoco.mj_comPos(THROWER, data)
+        heights.append(data.subtree_com[THROWER.body("ball").id, 2])
+    assert 2 * np.polyfit(s, heights, 2)[0] == pytest.approx(-9.81, rel=1e-3)
+    assert q[-1, 2] == pytest.approx(1.0, abs=1e-7)
+
+
+def test_loose_things_are_left_out_and_ropes_swing_out():
+    """A box without keys stays; a rope obeys gravity and friction, and need not rest at the end."""
+    clip = Clip(THROWER, {"x": keyed([0, 1], [0.0, 0.5], kind="clamped")})
+    able = machine(THROWER, driven=~LOOSE, force={"x": 12.0})
+    found = fit(clip, able, hard=[1.0])
+    assert found.certificate.holds
+    assert set(found.clip.tracks) == {"x", "rope", "arm", "root"}
+    q, v, a = found.clip.evaluate(found.t[2:-1])
+    assert abs(v[-1, THROWER.joint("rope").dofadr[0]]) > 0.1
+    data = mujoco.MjData(able.model)
+    dof, rope = THROWER.joint("x").dofadr[0], THROWER.joint("rope").dofadr[0]
+    for row in zip(q, v, a, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = row
+        mujoco.mj_inverse(able.model, data)
+        dry = -0.02 * row[1][rope] / np.hypot(row[1][rope], 0.01)
+        assert data.qfrc_inverse[rope] == pytest.approx(dry, abs=1e-6)
+        assert abs(data.qfrc_inverse[dof] + 4.0 * np.sign(row[1][dof])) <= 12.0 * (1 + 1e-3)
+
+
+def test_a_fit_starts_against_friction():
+    """The least time from rest to rest, with (force - friction) / m and then (force + friction) / m, is 1 s
+    for a force of 6.8 N: below it nothing fits, above it something does."""
+    clip = move(THROWER, "x", [0, 1], [0.0, 0.5])
+    mass = 2.2
+    words = {"hard": [1.0], "refine": 2, "deviation": 1e-3}
+    force = 0.5 * (2 * mass + np.sqrt((2 * mass) ** 2 + 4 * 16.0))  # 2 d (m / (f - 4) + m / (f + 4)) = 1
+    stiff = THROWER.__copy__()
+    stiff.dof_damping[THROWER.joint("rope").dofadr[0]] = 100.0  # one mass
+    with pytest.raises(PantographError, match="no motion was found"):
+        fit(clip, machine(stiff, driven=~LOOSE, force={"x": 0.96 * force}), **words)
+    found = fit(clip, machine(stiff, driven=~LOOSE, force={"x": 1.06 * force}), **words)
+    assert found.certificate.limits <= 1 + 1e-3
 
 
 HOPPER = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/><body name="trunk" pos="0 0 0">

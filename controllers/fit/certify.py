@@ -47,7 +47,8 @@ def examine(
         need = need - np.einsum("is,isj->ij", pushed.reshape(len(need), -1), J)
         stray = _strays(p.reshape(pieces, len(part), -1), t, sites, phases)
         share = _slips(pushed, t, sites, phases, machine)
-    missing = np.abs(need[:, ~machine.driven]).max(axis=1, initial=0.0) / largest
+    loose = ~machine.driven & clip.dofs  # what is not fitted has no track
+    missing = np.abs(need[:, loose]).max(axis=1, initial=0.0) / largest
     for used in (row.share for row in shares(trace, machine, need=need) if row.kind != MISSING):
         share = np.maximum(share, used.reshape(pieces, -1).max(axis=1))
     return Finding(share, missing.reshape(pieces, -1).max(axis=1), stray)

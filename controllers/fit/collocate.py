@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import dof_names
+from ...models import dof_names, name_of
 from ...sim.clip import Clip
 from ...sim.errors import PantographError
 from ...sim.kinds import SCALAR
@@ -48,9 +48,11 @@ def fit(
     """The motion nearest to ``clip`` that ``machine`` can make, through its poses at the ``hard`` times [s].
 
     Minimises the integral of ``deviation`` |q - keys|^2 plus ``effort`` |tau / strength|^2 + jerkiness over
-    all keyed joints; joints without keys move as physics and the fit want. ``phases`` declare contacts, into
-    which sites come without impact. It begins in the first pose, and begins and ends at the keyed velocity,
-    or ``at_rest``. ``step`` [s] is the longest piece of the first grid, ``most`` the most iterations on one.
+    all keyed joints; joints without keys move as physics and the fit want, but things that nothing keys,
+    drives or touches are left out. ``phases`` declare contacts, into which sites come without impact. It
+    begins in the first pose, and begins and ends ``at_rest``, or at the keyed velocity; what is then thrown,
+    with keys and without a drive, at any. What has neither is free at the end. ``step`` [s] is the longest
+    piece of the first grid, ``most`` the most iterations on one.
 
     Up to ``refine`` times, the pieces on which the motion does not hold to ``tolerance`` (limits, and forces
     missing relative to the largest) are cut, and limits are drawn in by what it exceeds them between points;
@@ -117,13 +119,15 @@ def _too_weak(wish: Wish, machine: Machine) -> str:
         if any(p.holds(np.array([t]))[0] for p in wish.phases):
             continue
         weight = machine.nominal.weight(wish.clip.evaluate(t, left=True).q)
+        weight += np.where(weight < 0, -1.0, 1.0) * machine.friction
         over = np.maximum(weight - machine.force_high, machine.force_low - weight)
         dof = np.where(machine.driven, over, -np.inf).argmax()
         if machine.driven[dof] and over[dof] > 0:
             limit = machine.force_high[dof] if weight[dof] > 0 else -machine.force_low[dof]
             return (
                 f"; at rest at {t:g} s {dof_names(machine.model)[dof]!r} needs {abs(weight[dof]):.4g} N m "
-                f"or N to hold the pose, its limit is {limit:.4g}"
+                f"or N to hold the pose{' and overcome its friction' if machine.friction[dof] else ''}, its "
+                f"limit is {limit:.4g}"
             )
     return ""
 
@@ -230,7 +234,11 @@ def _options(most: int, warm: bool) -> dict[str, Any]:
 
 
 def _clip(problem: Transcription, t: Array, point: Point) -> Clip:
-    return problem.charts.clip(t, point.q[::2], point.v[::2], point.a[0], point.a[2], problem.wish.clip)
+    like = problem.wish.clip
+    whole = problem.charts.clip(t, point.q[::2], point.v[::2], point.a[0], point.a[2], like)
+    joints = np.unique(like.model.dof_jntid[problem.inside])
+    names = [name_of(like.model, "joint", int(j)) for j in joints]
+    return Clip(like.model, {name: whole.tracks[name] for name in names}, like.q0)
 
 
 def _between(problem: Transcription, t: Array, point: Point) -> Point:

@@ -7,6 +7,7 @@ which decides their forces there; positions and velocities then stay as they wer
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from ...sim.errors import PantographError
 from ..nominal import difference, moved
 from .charts import Charts
 from .contact import Phase, independent, places, sites_of, touching
-from .machine import Machine
+from .machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
@@ -71,6 +72,21 @@ def grid(wish: Wish, step: float) -> Array:
     return np.append(np.concatenate(pieces), edges[-1])
 
 
+def moving(machine: Machine, wish: Wish) -> NDArray[np.bool_]:
+    """Freedoms (nv,) that a fit is about: not those of things that nothing keys, drives, or touches in a
+    phase, which stay as they are."""
+    tree = machine.model.dof_treeid
+    mine = tree[machine.driven | wish.clip.dofs | _carried(machine, wish.phases)]
+    return np.asarray(np.isin(tree, mine))
+
+
+def _carried(machine: Machine, phases: Sequence[Phase]) -> NDArray[np.bool_]:
+    """Freedoms (nv,) of what rests on the ground in ``phases``."""
+    m = machine.model
+    bodies = [m.site_bodyid[lookup(m, "site", site)] for site in sites_of(m, phases)]
+    return np.asarray(np.isin(m.dof_treeid, m.body_treeid[bodies]))
+
+
 class Transcription:
     """The program of a ``wish`` of ``machine`` over nodes ``t`` (n,) [s]."""
 
@@ -79,6 +95,7 @@ class Transcription:
         m = self.model = machine.model
         self.sites = sites_of(m, wish.phases)
         self.driven = np.flatnonzero(machine.driven)
+        self.inside = moving(machine, wish)
         self.charts = Charts(m)
         middle = 0.5 * (t[1:] + t[:-1])
         self.touched = {s: touching(wish.phases, s, middle) for s in self.sites}
@@ -119,8 +136,11 @@ class Transcription:
             power = ca.dot(ca.jtimes(self._places(at), at, self.charts.flow(at, v)), f)
             pushed = ca.Function("pushed", [at, v, f], [ca.gradient(power, v)])
             need -= pushed(q, v, f)
+        for dof in np.flatnonzero(self.machine.friction).tolist():
+            need[dof] += self.machine.friction[dof] * v[dof] / ca.sqrt(v[dof] ** 2 + WIDTH**2)
         size = np.maximum(self.strength, 0.1 * self.strength.max())
-        return ca.Function("balance", [wanted, x, v, a, tau, f], [need / ca.DM(size)])
+        rows = np.flatnonzero(self.inside).tolist()
+        return ca.Function("balance", [wanted, x, v, a, tau, f], [(need / ca.DM(size))[rows]])
 
     @cached_property
     def feet(self) -> Any:
@@ -170,15 +190,15 @@ class Transcription:
         """Variables are tangents from the keys, velocities, drive forces, accelerations, contact forces."""
         import casadi as ca
 
-        pieces = len(self.h)
+        pieces, inside = len(self.h), np.flatnonzero(self.inside).tolist()
         var = {name: ca.MX.sym(name, *size) for name, size in self.shape.items()}
         wanted, H = ca.DM(self.wanted.q.T), ca.DM(self.h).T
-        each: Any = ca.repmat(H, self.model.nv, 1)
+        each: Any = ca.repmat(H, len(inside), 1)
         ends = [_columns(self.states[k]) for k in range(3)]
         arguments = [x[:, cut] for cut in ends for x in (wanted, var["x"], var["v"])]
-        equal = list(self.step.map(pieces)(*arguments, H))
-        v0, vm, v1 = (var["v"][:, cut] for cut in ends)
-        a0, am, a1 = (var["a"][:, _columns(row)] for row in self.instants)
+        equal = [rows[inside, :] for rows in self.step.map(pieces)(*arguments, H)]
+        v0, vm, v1 = (var["v"][inside, cut] for cut in ends)
+        a0, am, a1 = (var["a"][inside, _columns(row)] for row in self.instants)
         equal += [
             (v1 - v0) / each - (a0 + 4.0 * am + a1) / 6.0,
             (vm - 0.5 * (v0 + v1)) / each - (a0 - a1) / 8.0,
@@ -188,7 +208,8 @@ class Transcription:
         here = [wanted[:, at], var["x"][:, at], var["v"][:, at], var["a"]]
         equal.append(self.balance.map(count)(*here, tau[:, at], var["f"]))
         below: list[Any] = []
-        self._limits(equal, below, (a0, am, a1), tau, var["v"])
+        sides = tuple(var["a"][:, _columns(row)] for row in self.instants)
+        self._limits(equal, below, sides, tau, var["v"])
         if self.sites:
             self._contacts(equal, below, self.feet.map(count)(*here), var["f"])
         g = ca.veccat(*equal, *below)
@@ -228,8 +249,12 @@ class Transcription:
             cost += _FORCES * ca.dot(ca.sum1((var["f"] / self.weight) ** 2), ca.DM(lengths).T)
         return cost
 
-    def _limits(self, equal: list[Any], below: list[Any], A: tuple[Any, Any, Any], tau: Any, v: Any) -> None:
-        """Rows for what bounds of single variables do not say."""
+    def _limits(self, equal: list[Any], below: list[Any], A: tuple[Any, ...], tau: Any, v: Any) -> None:
+        """Rows for what bounds of single variables do not say.
+
+        Drives have to bear all of dry friction at any speed: what of it is smoothed away at low speed,
+        f (1 - |v| / sqrt(v^2 + w^2)), is less than f w^2 / (v^2 + w^2), by which limits are drawn in.
+        """
         import casadi as ca
 
         mm, H = self.machine, ca.DM(self.h).T
@@ -242,9 +267,10 @@ class Transcription:
                 equal += [first[0], last[-1]]
         for k, dof in enumerate(self.driven.tolist()):
             top, high, low = mm.top_speed[dof], mm.force_high[dof], mm.force_low[dof]
-            if np.isfinite(top) and np.isfinite(high - low):
+            if np.isfinite(high - low) and (np.isfinite(top) or mm.friction[dof]):
+                hidden = mm.friction[dof] * WIDTH**2 / (v[dof, :] ** 2 + WIDTH**2)
                 push, speed = tau[k, :], v[dof, :] / top
-                below += [push / high + speed - 1.0, push / low - speed - 1.0]
+                below += [(push + hidden) / high + speed - 1.0, (push - hidden) / low - speed - 1.0]
         if np.isfinite(mm.current):
             each: Any = ca.DM(mm.ampere[self.driven] / mm.current).T
             below.append(each @ ca.sqrt(tau**2 + 1e-12) - 1.0)
@@ -308,13 +334,25 @@ class Transcription:
             slack = _SLACK if k and any(p.holds(self.times[k : k + 1])[0] for p in self.wish.phases) else 0.0
             low["x"][k, rows], high["x"][k, rows] = -slack, slack
         for k in (0, -1):
-            rows = np.ones(m.nv, dtype=bool) if k == 0 or self.wish.at_rest else keyed
+            rows = self._bound_speeds(k)
             low["v"][k, rows] = high["v"][k, rows] = 0.0 if self.wish.at_rest else self.wanted.v[k, rows]
+        for name in ("x", "v", "a"):
+            low[name][:, ~self.inside] = high[name][:, ~self.inside] = 0.0
         for k, site in enumerate(self.sites):
             free = np.ones(len(self.state_of), dtype=bool)
             free[self.instants[:, self.touched[site]]] = False
             low["f"][free, 3 * k : 3 * k + 3] = high["f"][free, 3 * k : 3 * k + 3] = 0.0
         return tuple(np.concatenate([x.ravel() for x in side.values()]) for side in (low, high))  # type: ignore[return-value]
+
+    def _bound_speeds(self, k: int) -> NDArray[np.bool_]:
+        """Freedoms (nv,) whose speeds at the begin (``k`` 0) and the end (-1) are given: of what is thrown,
+        hung on, or left to swing they are not."""
+        wish, driven = self.wish, self.machine.driven
+        now = [p for p in wish.phases if p.holds(self.t[[k]])[0]]
+        held = driven | _carried(self.machine, now)
+        if wish.at_rest:
+            return held | wish.clip.dofs if k else np.ones(self.model.nv, dtype=bool)
+        return held & wish.clip.dofs if k else held | ~wish.clip.dofs
 
     def _node(self, t: float) -> int:
         """Row of the node at a time among all states."""
