@@ -315,7 +315,7 @@ class Run(ABC):
         if joint is None:
             return ""
         return (
-            f"diverged near t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
+            f"diverged at t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
             f"{self.pace} the motion is too fast or too stiff; try a smaller step, or check forces and "
             "initial state"
         )
