@@ -136,8 +136,8 @@ class Transcription:
             power = ca.dot(ca.jtimes(self._places(at), at, self.charts.flow(at, v)), f)
             pushed = ca.Function("pushed", [at, v, f], [ca.gradient(power, v)])
             need -= pushed(q, v, f)
-        for dof in np.flatnonzero(self.machine.friction).tolist():
-            need[dof] += self.machine.friction[dof] * v[dof] / ca.sqrt(v[dof] ** 2 + WIDTH**2)
+        for rubs in np.flatnonzero(self.machine.friction).tolist():
+            need[rubs] += self.machine.friction[rubs] * v[rubs] / ca.sqrt(v[rubs] ** 2 + WIDTH**2)
         size = np.maximum(self.strength, 0.1 * self.strength.max())
         rows = np.flatnonzero(self.inside).tolist()
         return ca.Function("balance", [wanted, x, v, a, tau, f], [(need / ca.DM(size))[rows]])
