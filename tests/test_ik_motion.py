@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import ik_cases
 from oracles.ik_motions import figure_eight, wrist_arm
@@ -239,26 +239,27 @@ def test_streaming_never_breaks_a_limit_whatever_is_asked(seed):
         before = tick.v
 
 
-@settings(max_examples=15, deadline=None)
-@given(seeds)
-@example(139)  # so far that full steps towards it do not help
-def test_a_goal_that_jumps_is_reached_in_nearly_the_least_time_and_without_overshoot(seed):
+def test_a_goal_that_jumps_is_reached_in_nearly_the_least_time_and_without_overshoot():
     """Least time of one joint over a way s: a triangle of velocity, or a trapezoid when v_max is reached."""
-    rng = np.random.default_rng(seed)
     model, dt, v_max, a_max = load_model("arm6"), 0.01, 2.0, 15.0
-    q0 = np.array([0.3, 0.4, 0.8, 0.2, 0.7, 0.1]) + 0.1 * rng.normal(size=6)
-    there = np.clip(q0 + 0.3 * rng.normal(size=6), *(0.95 * model.jnt_range.T))
-    goal = Pose("tip", *ik_cases.pose_of(model, there, "tip"))
-    follower = Follower(model, dt=dt, q0=q0, velocity=v_max, acceleration=a_max)
-    ticks = [follower.step([goal]) for _ in range(150)]
-    assert ticks[-1].followed and np.abs(ticks[-1].v).max() < 1e-9
-    way = np.abs(ticks[-1].q - q0)
-    ramp = v_max**2 / a_max
-    least = np.where(way < ramp, 2 * np.sqrt(way / a_max), way / v_max + v_max / a_max).max()
-    late = max((k + 1 for k, tick in enumerate(ticks) if not tick.followed), default=0)
-    assert late * dt <= 1.25 * least + 8 * dt
-    beyond = np.sign(ticks[-1].q - q0) * (np.array([tick.q for tick in ticks]) - ticks[-1].q)
-    assert beyond.max() < 0.02 * way.max() + 1e-6
+    longer = []
+    for seed in (139, *range(40)):  # the first so far away that full steps towards it do not help
+        rng = np.random.default_rng(seed)
+        q0 = np.array([0.3, 0.4, 0.8, 0.2, 0.7, 0.1]) + 0.1 * rng.normal(size=6)
+        there = np.clip(q0 + 0.3 * rng.normal(size=6), *(0.95 * model.jnt_range.T))
+        goal = Pose("tip", *ik_cases.pose_of(model, there, "tip"))
+        follower = Follower(model, dt=dt, q0=q0, velocity=v_max, acceleration=a_max)
+        ticks = [follower.step([goal]) for _ in range(150)]
+        assert ticks[-1].followed and np.abs(ticks[-1].v).max() < 1e-9
+        way = np.abs(ticks[-1].q - q0)
+        ramp = v_max**2 / a_max
+        least = np.where(way < ramp, 2 * np.sqrt(way / a_max), way / v_max + v_max / a_max).max()
+        late = max((k + 1 for k, tick in enumerate(ticks) if not tick.followed), default=0)
+        longer.append((late - 2) * dt / least)  # a tick to see the goal, one cut off by the grid
+        beyond = np.sign(ticks[-1].q - q0) * (np.array([tick.q for tick in ticks]) - ticks[-1].q)
+        assert beyond.max() < 0.02 * way.max() + 1e-6
+    assert np.median(longer) < 1.1
+    assert max(longer) < 1.5  # ways that bend: the joint with the longest way is not the one that waits
 
 
 def test_streaming_keeps_named_geoms_apart():
