@@ -296,12 +296,14 @@ def test_a_floating_base_turns_against_its_wheel(seed):
     start = np.concatenate([rng.normal(size=3), normalize(rng.normal(size=4)), [0.0]])
     far = rng.uniform(1.0, 3.0)
     clip = Clip(SATELLITE, {"wheel": keyed([0, 1], [0.0, far], kind="clamped")}, start)
-    found = fit(clip, machine(SATELLITE, driven=np.arange(7) == 6), hard=[1.0])
+    able = machine(SATELLITE, driven=np.arange(7) == 6)
+    found = fit(clip, able, hard=[1.0])
     assert found.certificate.holds
     end = found.clip.evaluate(1.0).q
     turn = log(multiply(conjugate(start[3:7]), end[3:7]))
     np.testing.assert_allclose(turn, [0, 0, -far * 0.02 / (0.3 + 0.02)], atol=1e-7)
     np.testing.assert_allclose(end[:3], start[:3], atol=1e-7)
+    assert prove(found, able).holds  # though nothing steers the base
 
 
 def test_a_hopper_with_a_free_base_hops():

@@ -1,80 +1,112 @@
-"""A fitted motion tried: simulated by MuJoCo under a law, its forces cut at what the drives can give."""
+"""A fitted motion tried: simulated by MuJoCo with a law in the loop, forces cut at what the machine gives."""
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.control import Target
+from ...sim.clip import Clip, FreeTrack, Track
+from ...sim.control import Law, Sampled, Target
+from ...sim.curves import Curve, frozen
+from ...sim.engines.common import Broken
+from ...sim.engines.contact import ContactEngine
+from ...sim.engines.interface import Problem, Role, State
+from ...sim.scene.schema import ControllerItem
 from ..lqr import LQR
 from ..nominal import difference
 from .contact import places, touching
 from .fitted import Fitted
-from .machine import Machine
+from .machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
+WITHIN = 0.05
+"""How far [rad, m] a simulated motion may be from the fitted one that it proves."""
+_HORIZON = 1.0  # s: of deviations at the end count
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """A simulated run of a fitted motion: t (n,) [s], q (n, nq), ``error`` (n, nv), its largest ``worst``
-    [rad, m], and the part of samples ``saturated``, where a drive gave all it could."""
+    """A simulated run of a fitted motion under ``law``: t (n,) [s], q (n, nq), ``error`` (n, nv) of what was
+    fitted, its largest ``worst`` [rad, m], infinite if the run broke off, as ``message`` says; and the part
+    ``saturated`` of the law's samples in which it asked for more than the machine gives."""
 
+    law: str
     t: Array
     q: Array
     error: Array
     worst: float
+    within: float
     saturated: float
+    message: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the motion stayed ``within`` [rad, m] of the fitted one."""
+        return self.worst <= self.within
+
+    def __str__(self) -> str:
+        verdict = "holds" if self.holds else "DOES NOT HOLD"
+        far = f"within {self.worst:.3g} rad or m of the fitted motion" if self.t.size else "no motion"
+        return (
+            f"proof to {self.within:g} rad or m {verdict}: simulated with {self.law} in the loop, "
+            f"{self.message or far}, drives at their limits {self.saturated:.0%} of the time"
+        )
 
 
 def prove(
-    fitted: Fitted, machine: Machine, *, period: float | None = None, steps: int | None = None
+    fitted: Fitted,
+    machine: Machine,
+    *,
+    controller: ControllerItem | None = None,
+    period: float | None = None,
+    steps: int | None = None,
+    within: float = WITHIN,
 ) -> Proof:
-    """Simulate the clip from its start, the law sampled every ``period`` [s] (default: 2 ms, with contacts
-    0.5 ms), ``steps`` steps each; contacts and limits are the model's own.
+    """Simulate the clip from its start by the contact engine: contacts, limits and dry friction are the
+    model's own, each joint with a drive takes the law's forces as far as :func:`given_by` has them.
 
-    The law is LQR along the clip. With contacts, of which LQR's mechanism does not know, it is the fitted
-    forces and a servo at each driven joint.
+    The law is the scene's ``controller``, at its own period, or LQR along the clip. With contacts, of which
+    LQR's mechanism does not know, it is the fitted forces and a servo at each driven joint. It is sampled
+    every ``period`` [s] (default: 2 ms, with contacts 0.5 ms), ``steps`` steps each.
     """
-    clip = fitted.clip
-    period = period or (0.0005 if fitted.phases else 0.002)
-    steps = steps or (1 if fitted.phases else 4)
-    m = copy.copy(clip.model)
-    m.actuator_gainprm[:] = 0.0
-    m.actuator_biasprm[:] = 0.0
-    m.opt.timestep = period / steps
-    m.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
-    if fitted.phases:
-        m.opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-    d = mujoco.MjData(m)
-    start, end = clip.start, clip.end
-    ticks = round((end - start) / period)
-    law = _Servo(fitted, machine, period) if fitted.phases else _lqr(fitted, machine, period)
-    d.qpos[:], d.qvel[:], _ = clip.evaluate(start)
-    rows, errors, cut = [], [], 0
-    for k in range(ticks):
-        t = start + k * period
-        target = Target(*clip.evaluate(t))
-        rows.append(d.qpos.copy())
-        errors.append(difference(m, d.qpos, target.q))
-        tau, _ = law(t, d.qpos.copy(), d.qvel.copy(), target, None)
-        given = given_by(machine, tau, d.qvel)
-        cut += bool(np.any(given != tau))
-        d.qfrc_applied[:] = given
-        mujoco.mj_step(m, d, steps)
-    error = np.array(errors)
-    worst = float(np.abs(error).max()) if np.isfinite(error).all() else np.inf
-    return Proof(
-        np.asarray(start + period * np.arange(ticks), dtype=np.float64),
-        np.array(rows),
-        error,
-        worst,
-        cut / max(ticks, 1),
+    period = controller.period if controller else period or (0.0005 if fitted.phases else 0.002)
+    steps = steps or (max(1, round(period / 0.0005)))
+    fitted = _from_zero(fitted)
+    clip, model = fitted.clip, copy.copy(fitted.clip.model)
+    model.actuator_gainprm[:] = 0.0
+    model.actuator_biasprm[:] = 0.0
+    tracked = np.zeros(model.njnt, dtype=bool)
+    tracked[model.dof_jntid[machine.driven]] = True
+    start = clip.evaluate(0.0)
+    problem = Problem(
+        model=model,
+        state0=State(start.q, start.v, np.zeros(model.na)),
+        duration=max(1, round(clip.end / period)) * period,
+        roles=np.where(tracked, Role.TRACKED, Role.PASSIVE).astype(np.int8),
+        clip=clip,
+        integrator="implicitfast" if fitted.phases else "rk4",
+        step=period / steps,
+        sample_every=steps,
+        drives=np.zeros(model.nu, dtype=np.int8),
     )
+    name, law = _law(fitted, machine, problem, controller, period)
+    controls = Sampled(_Given(law, machine), problem, period)
+    try:
+        segment = ContactEngine().run(problem, (0.0, problem.duration), controls)
+    except Broken as broken:
+        segment = broken.segment
+    wanted = clip.evaluate(segment.t, left=True).q
+    error = np.array([difference(model, *row) for row in zip(segment.q, wanted, strict=True)])
+    error = np.where(clip.dofs, error.reshape(-1, model.nv), 0.0)
+    whole = segment.status == "done" and bool(np.isfinite(error).all())
+    worst = float(np.abs(error).max(initial=0.0)) if whole else np.inf
+    memory: _Count = controls.memory
+    cut = memory.cut / max(memory.ticks, 1)
+    return Proof(name, segment.t, segment.q, error, worst, within, cut, "" if whole else segment.message)
 
 
 def given_by(machine: Machine, tau: Array, v: Array) -> Array:
@@ -89,9 +121,80 @@ def given_by(machine: Machine, tau: Array, v: Array) -> Array:
     return given * min(1.0, machine.current / draw) if draw > 0.0 else given
 
 
-def _lqr(fitted: Fitted, machine: Machine, period: float) -> LQR:
-    clip, keyed = fitted.clip, np.zeros(machine.model.nv, dtype=bool)
-    return LQR(machine.model, machine.driven, clip.q0, clip, period, clip.end, keyed)
+class _Count(NamedTuple):
+    """Memory of a law that is cut: its own, its samples, and those in which it was cut."""
+
+    law: Any
+    ticks: int
+    cut: int
+
+
+class _Given:
+    """A law's forces as far as the machine gives them."""
+
+    def __init__(self, law: Law, machine: Machine) -> None:
+        self.law, self.machine, self.lost = law, machine, getattr(law, "lost", None)
+
+    def start(self) -> _Count:
+        return _Count(self.law.start(), 0, 0)
+
+    def __call__(self, t: float, q: Array, v: Array, target: Target, memory: _Count) -> tuple[Array, _Count]:
+        tau, inner = self.law(t, q, v, target, memory.law)
+        given = given_by(self.machine, tau, v)
+        cut = bool(np.any((given != tau) & self.machine.driven))
+        return given, _Count(inner, memory.ticks + 1, memory.cut + cut)
+
+
+def _law(
+    fitted: Fitted, machine: Machine, problem: Problem, controller: ControllerItem | None, period: float
+) -> tuple[str, Law]:
+    """The law of a proof, and what it is called."""
+    if controller:
+        from ...sim.compose import make_law
+
+        law = make_law(controller.law, problem, controller.parameters, period, model=fitted.clip.model)
+        return f"the scene's {controller.law}", law
+    if fitted.phases:
+        return "contacts and servos", _Servo(fitted, machine, period)
+    return "LQR", _Along(fitted, machine, period)
+
+
+def _from_zero(fitted: Fitted) -> Fitted:
+    """The same motion from time zero on, where runs begin."""
+    start = fitted.clip.start
+    phases = tuple(replace(p, start=p.start - start, stop=p.stop - start) for p in fitted.phases)
+    return replace(fitted, clip=shifted(fitted.clip, -start), t=fitted.t - start, phases=phases)
+
+
+def shifted(clip: Clip, by: float) -> Clip:
+    """A clip the time ``by`` [s] later."""
+
+    def later(track: Track) -> Track:
+        if isinstance(track, FreeTrack):
+            parts = (None if c is None else later(c) for c in (track.position, track.rotation))
+            return FreeTrack(*parts)  # type: ignore[arg-type]
+        assert isinstance(track, Curve)
+        return replace(track, times=frozen(track.times + by), knots=frozen(track.knots + by))
+
+    return Clip(clip.model, {name: later(track) for name, track in clip.tracks.items()}, clip.q0)
+
+
+class _Along:
+    """LQR along the fitted motion, to its end and no further, and what its dry friction needs."""
+
+    def __init__(self, fitted: Fitted, machine: Machine, period: float) -> None:
+        clip, keyed = fitted.clip, np.zeros(machine.model.nv, dtype=bool)
+        # a finite horizon: there is none without end where something cannot be steered, as a body in flight
+        self.lqr = LQR(machine.model, machine.driven, clip.q0, clip, period, clip.end, keyed, final=_HORIZON)
+        self.machine = machine
+
+    def start(self) -> None:
+        """No memory."""
+
+    def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
+        tau, _ = self.lqr(t, q, v, target, None)
+        dry = self.machine.friction * target.v / np.sqrt(target.v**2 + WIDTH**2)
+        return tau + np.where(self.machine.driven, dry, 0.0), None
 
 
 class _Servo:
@@ -113,6 +216,9 @@ class _Servo:
             self.felt[i] = 1.0 / np.maximum(np.diag(free), 1e-3 * np.diag(inverse))
             # a foot may come off: damping of what then moves must not swing up from sample to sample
             self.most[i] = 0.5 / np.diag(inverse) / period
+
+    def start(self) -> None:
+        """No memory."""
 
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,)."""
