@@ -48,6 +48,7 @@ class ComputedTorque:
         self.preview = Preview(clip, period, duration)
         self.passive = ~tracked & ~keyed
         self.keyed = keyed
+        self._all, self._any_passive = bool(tracked.all()), bool(self.passive.any())
         self.kp, self.kd = held_gains(2.0 * np.pi * frequency, damping, period)
         self.nominal = Nominal(model)
 
@@ -60,15 +61,17 @@ class ComputedTorque:
         middle = self.preview.at(t, target)
         error, rate = difference(m, q, target.q), target.v - v
         a = middle.a + self.kp * error + self.kd * rate
-        a = np.where(self.tracked, a, np.where(self.keyed, middle.a, 0.0))
+        if not self._all:
+            a = np.where(self.tracked, a, np.where(self.keyed, middle.a, 0.0))
         q_mid = moved(m, q, difference(m, target.q, middle.q))
         v_mid = v + middle.v - target.v
-        if self.passive.any():
+        if self._any_passive:
             q_mid = np.asarray(self._with_passive(q_mid, q, v))
             bias, inertia = self.nominal.inverse(q_mid, v_mid, a), self.nominal.mass_matrix(q_mid)
             p = self.passive
             a[p] = np.linalg.solve(inertia[np.ix_(p, p)], -bias[p])
-        return np.where(self.tracked, self.nominal.inverse(q_mid, v_mid, a), 0.0), None
+        tau = self.nominal.inverse(q_mid, v_mid, a)
+        return tau if self._all else np.where(self.tracked, tau, 0.0), None
 
     def _with_passive(self, q_mid: Array, q: Array, v: Array) -> Array:
         """``q_mid`` with passive joints carried on by their own velocity."""

@@ -83,6 +83,7 @@ class LQR:
         self.final = None if final is None else positive("the LQR's final", final, zero=True)
         self.model, self.tracked, self.keyed = model, tracked, keyed
         clip, self.unkeyed = aimed(clip, {} if goal is None else goal, "the LQR's goal")
+        self._all = bool(tracked.all())
         self.period, self.preview = period, Preview(clip, period, duration)
         self.nominal = Nominal(model)
         moving = ~keyed
@@ -129,9 +130,25 @@ class LQR:
 
     def aim(self, t: float, q: Array, v: Array, target: Target) -> tuple[Array, Array]:
         """The way (2 nv,) from state q, v to where it belongs, and the joint forces (nv,) that keys need."""
-        target = target._replace(q=np.where(self.unkeyed, self.preview.clip.q0, target.q))
+        if self.unkeyed.any():
+            target = target._replace(q=np.where(self.unkeyed, self.preview.clip.q0, target.q))
         error = np.concatenate([difference(self.model, q, target.q), target.v - v])
-        return error, self.nominal.inverse(*self.preview.at(t, target))
+        return error, self._needed(t, target)
+
+    def _needed(self, t: float, target: Target) -> Array:
+        """Joint forces (nv,) that the keys need at time ``t`` [s]; live goals are not known before."""
+        tick = t / self.period
+        on_grid = abs(tick - round(tick)) < 1e-6 and 0 <= round(tick) < len(self.preview.times)
+        if on_grid and self.preview.known(target):
+            return np.asarray(self._forces[min(round(tick), len(self._forces) - 1)])
+        return self.nominal.inverse(*self.preview.at(t, target))
+
+    @cached_property
+    def _forces(self) -> Array:
+        """What the keys need (ticks, nv), on keys that rest (1, nv)."""
+        out = np.zeros((len(self.solution.u), self.model.nv))
+        out[:, self.tracked] = self.solution.u
+        return out
 
     def start(self) -> None:
         """No memory."""
@@ -139,4 +156,5 @@ class LQR:
     def __call__(self, t: float, q: Array, v: Array, target: Target, memory: None) -> tuple[Array, None]:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
         error, needed = self.aim(t, q, v, target)
-        return np.where(self.tracked, needed + self.gains[self.tick(t)] @ error, 0.0), None
+        tau = self.gains[self.tick(t)] @ error + needed
+        return tau if self._all else np.where(self.tracked, tau, 0.0), None

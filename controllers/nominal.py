@@ -100,6 +100,8 @@ class Nominal:
 
 def difference(model: mujoco.MjModel, q: Array, to: Array) -> Array:
     """Tangent (nv,) from configuration ``q`` (nq,) to ``to`` (nq,)."""
+    if model.nq == model.nv:  # no ball or free joint
+        return np.asarray(to - q)
     out = np.empty(model.nv)
     mujoco.mj_differentiatePos(model, out, 1.0, q, to)
     return out
@@ -107,6 +109,8 @@ def difference(model: mujoco.MjModel, q: Array, to: Array) -> Array:
 
 def moved(model: mujoco.MjModel, q: Array, by: Array) -> Array:
     """Configuration (nq,) that lies the tangent ``by`` (nv,) away from ``q``."""
+    if model.nq == model.nv:
+        return np.asarray(q + by)
     out = np.array(q, dtype=float)
     mujoco.mj_integratePos(model, out, by, 1.0)
     return out

@@ -40,7 +40,9 @@ class Preview:
         """The target ``offset`` periods after ``t`` [s], where it is ``now``: freedoms without keys, as
         those of live goals, go on with their acceleration."""
         ahead, clip, s = self._keyed(t), self.clip, self.offset * self.period
-        if not (now.v[~clip.dofs].any() or now.a[~clip.dofs].any()):
+        if not len(self._loose):
+            return ahead
+        if not (now.v[self._loose].any() or now.a[self._loose].any()):
             return Target(np.where(clip.qpos_mask, ahead.q, now.q), ahead.v, ahead.a)
         q = moved(clip.model, now.q, s * now.v + 0.5 * s**2 * now.a)
         return Target(
@@ -48,6 +50,19 @@ class Preview:
             np.where(clip.dofs, ahead.v, now.v + s * now.a),
             np.where(clip.dofs, ahead.a, now.a),
         )
+
+    @cached_property
+    def _loose(self) -> NDArray[np.intp]:
+        """Freedoms without keys."""
+        return np.flatnonzero(~self.clip.dofs)
+
+    def known(self, now: Target) -> bool:
+        """Whether the target ``now`` is the clip's own also where it has no keys."""
+        if not len(self._loose):
+            return True
+        rest = now.v[self._loose].any() or now.a[self._loose].any()
+        loose_q = ~self.clip.qpos_mask
+        return not rest and bool((now.q[loose_q] == self.clip.q0[loose_q]).all())
 
     def _keyed(self, t: float) -> Target:
         """The keys ``offset`` periods after ``t``: from the grid where ``t`` is a tick of it."""

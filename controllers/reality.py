@@ -53,8 +53,8 @@ class Loop:
     - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
       :class:`~pantograph.controllers.play.Play`;
     - ``learned``: file of forces that :mod:`~pantograph.controllers.ilc` has learned, added to the law's;
-    - ``friction`` [N m, N]: dry friction that drives lose, smoothed below ``stiction`` [rad/s, m/s], or below
-      the speed that it stops within a period.
+    - ``friction`` [N m, N]: dry friction at the joints, beside what drives give, smoothed below ``stiction``
+      [rad/s, m/s], or below the speed that it stops within a period.
 
     Raises PantographError for values that make no sense, for what drives do at joints that are not
     ``tracked`` (nv,), and for ``saturation`` and ``top_speed`` of drives that can give anything.
@@ -91,6 +91,7 @@ class Loop:
         self.late = int(np.ceil(positive("delay", delay, zero=True) / period - 1e-9))
         self.drives = Drives(model, tracked, saturation, top_speed)
         self.friction = per_joint(model, "friction", friction, tracked=tracked)
+        self.lost = self._lost if self.friction.any() else None
         stopped = self.friction * period / felt_inertia(model, q0)
         self.stiction = np.maximum(positive("stiction", stiction), stopped)
         width = per_joint(model, "play", play, tracked=tracked)
@@ -151,8 +152,11 @@ class Loop:
         if len(self.play.dofs):
             at = difference(self.model, self.model.qpos0, q)
             given, rotors = self.play.pass_on(given, at, v, rotors or self.play.start(at, v))
-        given = np.asarray(given - self.friction * np.tanh(v / self.stiction))
         return given, LoopMemory(inner, seen, queue[1:], told, middles, rotors, cut)
+
+    def _lost(self, v: Array) -> Array:
+        """What dry friction takes (nv,) at speeds ``v`` (nv,), also from a drive at its limit."""
+        return np.asarray(-self.friction * np.tanh(v / self.stiction))
 
     def _measure(self, q: Array, play: Array | None) -> tuple[Array, Array | None]:
         """What the encoders show, (nq,), and where the middles of the plays are now."""

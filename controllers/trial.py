@@ -102,6 +102,7 @@ class _Watched:
 
     def __init__(self, law: Law, limits: tuple[Array, Array]) -> None:
         self.law, (self.low, self.high) = law, limits
+        self.lost = getattr(law, "lost", None)
         self.seen: list[_Sample] = []
 
     def start(self) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import mujoco
@@ -31,7 +32,10 @@ class Target(NamedTuple):
 
 
 class Law(Protocol):
-    """A control law: the same input and memory give the same output, in any order of calls."""
+    """A control law: the same input and memory give the same output, in any order of calls.
+
+    One that also has ``lost(v)`` tells forces (nv,) that act at speeds v (nv,) beside what drives give.
+    """
 
     def start(self) -> Any:
         """Memory before the first sample; None for a law without memory."""
@@ -55,7 +59,10 @@ class Sampled:
         self.tracked = problem.dofs(Role.TRACKED)
         self.actuators = controlled_actuators(problem.model, problem.drives)
         self.memory = law.start()
-        self.nu = problem.model.nu
+        self.lost = getattr(law, "lost", None)
+        self.all_tracked = bool(self.tracked.all())
+        self.idle = np.zeros(problem.model.nu)
+        self.idle.setflags(write=False)
         self._first, self._targets = -1, self.clip.evaluate(np.zeros(1))
         self.live = problem.live(period) if problem.live is not None else None
 
@@ -68,13 +75,17 @@ class Sampled:
         if self.live is not None:
             target = Target(*self.live.at(t, q, v, target))
         tau, self.memory = self.law(t, q, v, target, self.memory)
-        qfrc = np.where(self.tracked, tau, 0.0)
+        qfrc = tau.copy() if self.all_tracked else np.where(self.tracked, tau, 0.0)
         if not np.isfinite(qfrc).all():
             joint = name_of(self.clip.model, "joint", int(self.clip.model.dof_jntid[~np.isfinite(qfrc)][0]))
             raise EngineError(f"the controller gives no finite force for joint {joint!r}")
-        ctrl = np.zeros(self.nu)
-        ctrl[self.actuators.index] = self.actuators.ctrl_for(qfrc, q, v)
-        qfrc[self.actuators.dof] = 0.0
+        ctrl = self.idle
+        if len(self.actuators.index):
+            ctrl = self.idle.copy()
+            ctrl[self.actuators.index] = self.actuators.ctrl_for(qfrc, q, v)
+            qfrc[self.actuators.dof] = 0.0
+        if self.lost is not None:
+            qfrc += self.lost(v)
         return Held(ctrl, qfrc)
 
     def _target(self, k: int) -> Target:
@@ -107,11 +118,18 @@ class JointActuators:
 
     def ctrl_for(self, tau: Array, q: Array, v: Array) -> Array:
         """The ctrl (n,) that give joint forces ``tau`` (nv,) [N, N m] now, within the control ranges."""
-        now = np.stack([np.ones(len(self.gear)), self.gear * q[self.qpos], self.gear * v[self.dof]], axis=1)
-        gain, bias = (self.gain * now).sum(axis=1), (self.bias * now).sum(axis=1)
-        force = tau[self.dof] / self.gear - bias
+        force, gain = tau[self.dof] / self.gear, self.gain[:, 0]
+        if not self._motors:
+            length, rate = self.gear * q[self.qpos], self.gear * v[self.dof]
+            gain = gain + self.gain[:, 1] * length + self.gain[:, 2] * rate
+            force = force - self.bias[:, 0] - self.bias[:, 1] * length - self.bias[:, 2] * rate
         ctrl = np.divide(force, gain, out=np.zeros_like(force), where=gain != 0.0)
         return np.asarray(np.minimum(np.maximum(ctrl, self.low), self.high))
+
+    @cached_property
+    def _motors(self) -> bool:
+        """Whether forces are ctrl times a constant."""
+        return not (self.bias.any() or self.gain[:, 1:].any())
 
 
 def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> JointActuators:

@@ -152,3 +152,26 @@ def test_predictions_know_what_the_loop_lets_through():
         made = make_law(law, problem, {"saturation": 0.25}, 0.01).law
         limit = made.high if isinstance(made, MPC) else made.shooting.weights.high
         assert limit[0] == pytest.approx(0.25 * model.actuator_ctrlrange[0, 1])
+
+
+@pytest.mark.parametrize("engine", ["smooth", "contact"])
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_friction_acts_beside_a_drive_at_its_limit(tmp_path, engine, way):
+    """1 kg, a motor of 1 N and 0.5 N of friction: -1.5 m/s in a second of braking, 0.5 of driving."""
+    (tmp_path / "slide.xml").write_text(slide())
+
+    def change(**words):
+        scene = Scene(
+            duration=1.0,
+            models=[{"file": str(tmp_path / "slide.xml")}],
+            roles={"tracked": ["x"]},
+            keys=[{"joint": "x", "times": [0], "values": [100.0 * way]}],
+            initial={"position": {"x": 0.0}, "velocity": {"x": 3.0}},
+            controller={"law": "pd", "period": 0.002, **words},
+            solver={"engine": engine},
+        )
+        recording = run(scene)
+        return recording.v[-1, 0] - recording.v[0, 0]
+
+    assert change() == pytest.approx(way, abs=1e-6)
+    assert change(friction=0.5) == pytest.approx(way - 0.5, abs=1e-6)

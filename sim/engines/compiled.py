@@ -50,6 +50,7 @@ class Compiled:
         self.q_free, self.v_free = np.array(lay.q_free, dtype=int), np.array(lay.v_free, dtype=int)
         self.q_keyed, self.v_keyed = np.array(lay.q_keyed, dtype=int), np.array(lay.v_keyed, dtype=int)
         self.u_held = np.array(lay.u_held, dtype=int)
+        self.whole = not (len(self.q_keyed) or len(self.v_keyed))
         self.stepper = Stepper(self.smooth, method, CHUNK)
         self.nodes = np.asarray(method.c)
         self.timed_q = np.isin(self.q_keyed, timed.qpos)
@@ -58,7 +59,7 @@ class Compiled:
 
     def gather(self, q: Array, v: Array, act: Array) -> Array:
         """The compiled model's state (nx,) of the whole model's."""
-        return np.concatenate([q[self.q_free], v[self.v_free], act])
+        return np.concatenate([q, v, act] if self.whole else [q[self.q_free], v[self.v_free], act])
 
     def spread(self, x: Array, w: Array) -> tuple[Array, Array, Array]:
         """The whole model's q, v, act of the compiled model's state and a prescribed row."""

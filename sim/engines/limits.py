@@ -101,6 +101,10 @@ class Limits:
         near = np.minimum(gap[:-1], gap[1:]) < step * (closing[:-1] - closing[1:])
         return np.asarray((gap[1:] < 0) | (turned & near))
 
+    def _far(self, q: Array, v: Array, step: float) -> bool:
+        """Whether no limit can be suspect: all are farther than any joint comes in a step and back."""
+        return bool(self.gaps(q).min() > 2.0 * step * max(v.max(), -v.min()))
+
     def near(
         self, q0: Array, v0: Array, q1: Array, v1: Array, step: float, resting: tuple[Limit, ...]
     ) -> list[Limit]:
@@ -114,6 +118,8 @@ class Limits:
     def doubtful(self, q: Array, v: Array, step: float, resting: tuple[Limit, ...]) -> NDArray[np.bool_]:
         """Whether each of n steps between states q (n + 1, nq) passes a limit, or may."""
         if not self.each:
+            return np.zeros(len(q) - 1, dtype=bool)
+        if self._far(q, v, step):
             return np.zeros(len(q) - 1, dtype=bool)
         found = self.suspect(q, v, step)
         still = {limit.joint for limit in resting}

@@ -102,6 +102,9 @@ class FixedRun(Run):
         w = c.on_grid(k, n)
         path = c.stepper(c.gather(self.q, self.v, self.act), c.held(self.held), n, self.h, w)
         self.evaluations += n * c.stepper.stages
+        if c.whole:
+            path = path.copy()
+            return path[:, : c.nq], path[:, c.nq : c.nq + c.nv], path[:, c.nq + c.nv :]
         q, v = np.empty((n + 1, m.nq)), np.empty((n + 1, m.nv))
         q[:, c.q_free], v[:, c.v_free] = path[:, : c.nq], path[:, c.nq : c.nq + c.nv]
         if c.q_keyed.size:
