@@ -395,7 +395,7 @@ def test_a_limit_for_all_and_one_for_a_joint(tmp_path):
 
 def app_of_fit(tmp_path, options):
     import typer
-    from pantograph.controllers.fit.command import fit as command
+    from pantograph.controllers.fit_command import fit as command
 
     app = typer.Typer()
     app.command()(command)
@@ -424,7 +424,7 @@ def test_mistakes_are_told(clip, words, message):
 
 def test_the_command_checks_retimes_and_fits(tmp_path):
     import typer
-    from pantograph.controllers.fit.command import fit as command
+    from pantograph.controllers.fit_command import fit as command
 
     app = typer.Typer()
     app.command()(command)
@@ -456,7 +456,7 @@ def test_the_command_checks_retimes_and_fits(tmp_path):
 def test_a_scene_says_machine_and_contacts(tmp_path):
     """The table [fit] stands for the options; the film has the keys on the left."""
     import typer
-    from pantograph.controllers.fit.command import fit as command
+    from pantograph.controllers.fit_command import fit as command
 
     app = typer.Typer()
     app.command()(command)

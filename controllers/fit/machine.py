@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ...models import lookup
 from ...sim.engines.derive import dry_friction
 from ...sim.errors import PantographError
 from ...sim.kinds import SCALAR
@@ -66,6 +67,7 @@ class Machine:
 def machine(
     model: mujoco.MjModel,
     *,
+    position: Mapping[str, tuple[float, float]] | None = None,
     velocity: Limit = None,
     acceleration: Limit = None,
     jerk: Limit = None,
@@ -78,13 +80,21 @@ def machine(
     """The machine of a model: ranges and forces as its file says, the rest as given (None: no limit).
 
     A limit is one number for all that is ``driven``, or one a joint by name (other joints have none);
-    ``force`` replaces the file's. Raises PantographError for limits that are not positive, for names of no
+    ``force`` replaces the file's, and so does ``position``, joint -> (low, high), for the joints that it
+    names. Raises PantographError for limits that are not positive, for names of no
     joint, and for a battery that feeds nothing.
     """
     low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in np.flatnonzero(model.jnt_limited):
         if int(model.jnt_type[joint]) in SCALAR:
             low[model.jnt_dofadr[joint]], high[model.jnt_dofadr[joint]] = model.jnt_range[joint]
+    for name, ends in ({} if position is None else position).items():
+        named = lookup(model, "joint", name)
+        if int(model.jnt_type[named]) not in SCALAR or not ends[0] < ends[1]:
+            raise PantographError(
+                f"position of {name!r} is the range of a hinge or slide, low before high, not {tuple(ends)}"
+            )
+        low[model.jnt_dofadr[named]], high[model.jnt_dofadr[named]] = ends
     force_low, force_high = force_limits(model)
     if force is not None:
         force_high = _limit(model, "force", force)

@@ -90,13 +90,13 @@ def retime(
 ) -> Retimed:
     """The timing of ``clip`` that is fastest, or with ``keep`` nearest to its own: nowhere faster than keyed.
 
-    Limits of velocity, acceleration, force (with the motor's top speed) and current hold; the path does not
-    change, and stretches where nothing moves keep their length. It starts and ends ``at_rest``, or at the
-    keyed speed. It stops where the path has a corner, as linear keys have, and with a limit on jerk where its
-    curvature jumps, as it does at the keys of curves that are not natural or clamped; the motion is then
-    quintics through points of the path. Raises PantographError where the path itself is impossible (positions
-    out of range, a pose that the drives cannot hold), for freedoms without a drive, and where no timing is
-    found.
+    Limits of velocity, acceleration, force (with the motor's top speed, and dry friction) and current hold;
+    the path, the time of the first key, and stretches where nothing moves stay as they are. It starts and
+    ends ``at_rest``, or at the keyed speed. It stops where the path has a corner, as linear keys have, and
+    with a limit on jerk where its curvature jumps, as it does at the keys of curves that are not natural or
+    clamped; the motion is then quintics through points of the path. Raises PantographError where the path
+    itself is impossible (positions out of range, a pose that the drives cannot hold), for freedoms without a
+    drive, and where no timing is found.
     """
     tree = machine.model.dof_treeid
     loose = np.flatnonzero(~machine.driven & np.isin(tree, tree[clip.dofs]))
@@ -134,7 +134,7 @@ def _parabolas(grid: Grid, x: Array) -> Callable[[float], tuple[Array, Clip]]:
     bend = 0.5 * np.diff(x) / grid.h
 
     def at(slow: float) -> tuple[Array, Clip]:
-        t = np.concatenate([[0.0], np.cumsum(steps)]) * slow
+        t = grid.s[0] + np.concatenate([[0.0], np.cumsum(steps)]) * slow
         tracks: dict[str, Track] = {}
         for name, track in grid.clip.tracks.items():
             assert isinstance(track, Curve)
@@ -174,7 +174,7 @@ def _slowed(
         raise PantographError(f"no timing helps: {out_of_range[0]}; change the keys, or fit the motion")
     t, clip = at(slow)
     stops = tuple(Stop(c.s, float(np.interp(c.s, s, t)), c.why) for c in corners if c.why)
-    return Retimed(clip, float(t[-1]), found, s, t, stops, slow)
+    return Retimed(clip, float(t[-1] - t[0]), found, s, t, stops, slow)
 
 
 def _at_pace(trace: Trace, slow: float) -> Trace:

@@ -151,7 +151,7 @@ def _quintics(clip: Clip, now: _Nodes) -> Callable[[float], tuple[Array, Clip]]:
     charts = Charts(clip.model)
 
     def at(slow: float) -> tuple[Array, Clip]:
-        t, square = now.t * slow, slow**2
+        t, square = clip.start + now.t * slow, slow**2
         new = charts.clip(t, now.q, now.v / slow, now.a0 / square, now.a1 / square, clip)
         return t, Clip(clip.model, {name: new.tracks[name] for name in clip.tracks}, clip.q0)
 

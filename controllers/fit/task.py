@@ -22,7 +22,8 @@ LIMITS = ("velocity", "acceleration", "jerk", "force", "top_speed", "ampere")
 
 
 class Task(NamedTuple):
-    """The plan of the scene, its keys, its machine, and the arguments of :func:`~.collocate.fit`."""
+    """The plan of the scene, its keys, its machine, the arguments of :func:`~.collocate.fit`, and how near a
+    proof has to be [rad, m]."""
 
     plan: Plan
     clip: Clip
@@ -30,6 +31,7 @@ class Task(NamedTuple):
     hard: tuple[float, ...]
     phases: tuple[Phase, ...]
     words: dict[str, Any]
+    within: float
 
 
 def task_of(scene: Scene, **given: Any) -> Task:
@@ -46,13 +48,14 @@ def task_of(scene: Scene, **given: Any) -> Task:
     driven = _driven(model, said["passive"])
     able = machine(
         model,
+        position={**(item.position or {}), **(said["position"] or {})},
         driven=driven,
         current=math.inf if said["current"] is None else said["current"],
         **{word: _by_joint(model, driven, said[word], getattr(item, word)) for word in LIMITS},
     )
     phases = tuple(Phase(p.start, p.stop, tuple(p.sites), p.friction, p.ground) for p in item.phases)
     words = {w: said[w] for w in ("effort", "deviation", "step", "tolerance", "at_rest")}
-    return Task(plan, plan.problem.clip, able, tuple(said["hard"]), phases, words)
+    return Task(plan, plan.problem.clip, able, tuple(said["hard"]), phases, words, said["within"])
 
 
 def _by_joint(model: mujoco.MjModel, driven: NDArray[np.bool_], given: Any, scene: Any) -> Any:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ...controllers.cli import control, gains
-from ...controllers.fit.command import fit
+from ...controllers.fit_command import fit
 from ...hardware.cli import app as servo
 from ..errors import PantographError, RunError
 from . import show

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from .schema.item import Item
-from .values import Finite, NotNegative, Positive, Switch, at
+from .values import Finite, NotNegative, Positive, Span, Switch, at
 
 Limit = Positive | dict[str, Positive] | None
 
@@ -34,6 +34,7 @@ class FitItem(Item):
     how: Literal["check", "retime", "nearest", "fit"] = Field(
         "check", description="check; retime: fastest timing; nearest timing; fit: nearest motion"
     )
+    position: dict[str, Span] | None = Field(None, description="range of a joint; default: the model's")
     velocity: Limit = None
     acceleration: Limit = None
     jerk: Limit = None
@@ -48,4 +49,5 @@ class FitItem(Item):
     deviation: NotNegative = Field(1.0, description="weight of deviation from the keys")
     step: Positive = Field(0.04, description="longest piece of the first grid, seconds")
     tolerance: Positive = Field(1e-3, description="of the certificate, relative")
+    within: Positive = Field(0.05, description="how far a simulated motion may be from a fitted one, rad, m")
     at_rest: Switch = Field(True, description="begin and end at rest, else at the keyed velocity")

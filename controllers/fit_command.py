@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ...sim.errors import PantographError
+from ..sim.errors import PantographError
 
 console = Console()
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with keyed joints.")]
@@ -42,8 +42,14 @@ def fit(
     passive: Annotated[
         list[str] | None, typer.Option(help="Joint without a drive, beside free joints.")
     ] = None,
+    position: Annotated[
+        list[str] | None, typer.Option(help="Range of a joint [rad, m]: elbow=-1:2; default: the model's.")
+    ] = None,
     hard: Annotated[
         list[float] | None, typer.Option(help="Time of a key to pass through (fit only).")
+    ] = None,
+    keys: Annotated[
+        Path | None, typer.Option(help="File (TOML) for the new motion as tables of keys for a scene.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the recording, and for bare file names.")] = Path(
         "out"
@@ -53,71 +59,97 @@ def fit(
 
     Machine and contacts stand in the scene's table [fit]; options go before it.
     """
-    from ...sim.cli import show
-    from ...sim.scene.load import load_scene
-    from . import check
-    from .task import LIMITS, task_of
+    from ..sim.cli import show
+    from ..sim.scene.load import load_scene
+    from .fit import check
+    from .fit.task import LIMITS, task_of
 
     loaded = load_scene(scene)
     how = how or (loaded.fit.how if loaded.fit else "check")
     if how not in WAYS:
         raise PantographError(f"no way {how!r} to fit; there is: {', '.join(WAYS)}")
     texts = dict(zip(LIMITS, (velocity, acceleration, jerk, force, top_speed, ampere), strict=True))
-    limits = {word: _limit(word, text) for word, text in texts.items() if text}
+    limits: dict[str, Any] = {word: _limit(word, text) for word, text in texts.items() if text}
+    limits |= {"position": dict(map(_range, position))} if position else {}
     task = task_of(loaded, **limits, current=current, passive=passive or None, hard=hard or None)
-    clip, able, phases = task.clip, task.machine, task.phases
+    clip, phases = task.clip, task.phases
     if not clip.end > clip.start:
         raise PantographError(f"{scene} keys no motion: no joint has two keys")
-    report = check(clip, able, phases=phases)
+    report = check(clip, task.machine, phases=phases)
     console.print(_table(report, "as keyed"))
     _advise(report, phases)
     if how == "check":
         raise typer.Exit(0 if report.possible else 1)
     if how == "fit":
         with show.status(f"fitting {scene.stem}") as tell:
-            new, good = _fit(task, tell)
+            found = _fit(task, tell)
+        good = found.certificate.holds
     else:
         with show.status(f"retiming {scene.stem}"):
-            new, good = _retime(clip, able, how == "nearest")
-    before, after = _recording(task.plan, clip), _recording(task.plan, new)
+            found = _retime(task, how == "nearest")
+        good = found.report.possible
+    before, after = _recording(task.plan, clip), _recording(task.plan, found.clip)
     console.print(f"recording: {after.save(out / f'{scene.stem}.fit.npz')}")
+    if keys is not None:
+        _write_keys(found.clip, scene, _inside(out, keys), loaded.angle == "degree")
+    if how == "fit":
+        with show.status(f"simulating {scene.stem}"):
+            good = _prove(task, found, loaded.controller) and good
     if film is not None:
-        from ...sim.shoot import shoot
+        from ..sim.shoot import shoot
 
-        target = out / film if film.parent == Path() else film
         with show.film_notes(console):
-            console.print(f"film: {shoot(before, target, beside=after)}, as keyed on the left")
+            made = shoot(before, _inside(out, film), beside=after)
+        console.print(f"film: {made}, as keyed on the left")
     raise typer.Exit(0 if good else 1)
 
 
-def _fit(task: Any, tell: Any) -> tuple[Any, bool]:
-    from . import fit as solve
-    from . import prove
+def _inside(out: Path, file: Path) -> Path:
+    return out / file if file.parent == Path() else file
+
+
+def _fit(task: Any, tell: Any) -> Any:
+    from .fit import fit as solve
 
     found = solve(task.clip, task.machine, hard=task.hard, phases=task.phases, progress=tell, **task.words)
     console.print(f"fitted: up to {found.deviation:.3g} rad or m from the keys")
     console.print(str(found.certificate), soft_wrap=True, style="" if found.certificate.holds else "yellow")
-    if tell is not None:
-        tell("simulating")
-    proof = prove(found, task.machine)
-    law = "contacts and servos" if task.phases else "LQR"
-    console.print(
-        f"simulated with {law} in the loop: within {proof.worst:.3g} rad or m of the fitted "
-        f"motion, drives at their limits {proof.saturated:.0%} of the time",
-        soft_wrap=True,
-    )
-    return found.clip, found.certificate.holds
+    return found
 
 
-def _retime(clip: Any, able: Any, keep: bool) -> tuple[Any, bool]:
-    from . import retime
+def _prove(task: Any, found: Any, controller: Any) -> bool:
+    """Whether the simulated motion stays near the fitted one."""
+    from .fit import prove
 
-    found = retime(clip, able, keep=keep)
-    was = clip.end - clip.start
+    proof = prove(found, task.machine, controller=controller, within=task.within)
+    console.print(str(proof), soft_wrap=True, style="" if proof.holds else "yellow")
+    return bool(proof.holds)
+
+
+def _retime(task: Any, keep: bool) -> Any:
+    from .fit import retime
+
+    found = retime(task.clip, task.machine, keep=keep, at_rest=task.words["at_rest"])
+    was = task.clip.end - task.clip.start
     console.print(_table(found.report, "retimed"))
     console.print(f"retimed: {found.duration:.4f} s, was {was:.4f} s")
     _tell_stops(found)
-    return found.clip, found.report.possible
+    if task.phases:
+        console.print(
+            "[yellow]note:[/] retiming knows no contacts: what \\[[fit.phases]] would carry is left to the "
+            "drives; --how fit counts it",
+            soft_wrap=True,
+        )
+    return found
+
+
+def _write_keys(clip: Any, scene: Path, file: Path, degree: bool) -> None:
+    from .fit.keys import as_keys
+
+    found = as_keys(clip, degree=degree)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"# Made possible from {scene.name}: in place of its keys of these joints.\n{found.text}")
+    console.print(f"keys: {file}, {found.rows} a joint, within {found.error:.1e} rad or m of the motion")
 
 
 def _tell_stops(found: Any) -> None:
@@ -188,17 +220,27 @@ def _recording(plan: Any, clip: Any) -> Any:
 
     import numpy as np
 
-    from ...sim.engines.interface import Role
-    from ...sim.plan import Choice
-    from ...sim.run import run
+    from ..sim.engines.interface import Role
+    from ..sim.plan import Choice
+    from ..sim.run import run
 
     roles = np.full_like(plan.problem.roles, Role.KEYED)
     h = 1.0 / 240.0
-    steps = max(1, math.ceil((clip.end - clip.start) / h))
+    steps = max(1, math.ceil(clip.end / h - 1e-9))
     problem = replace(plan.problem, clip=clip, roles=roles, duration=steps * h, step=h, sample_every=1)
     kinematic = Choice("kinematic", "the motion is known")
     setup = replace(plan.setup, roles=roles, clip=clip)
     return run(replace(plan, setup=setup, problem=problem, engine=kinematic, period=None))
+
+
+def _range(text: str) -> tuple[str, tuple[float, float]]:
+    """A joint and its range from a text such as elbow=-1:2."""
+    name, _, ends = text.rpartition("=")
+    try:
+        low, high = (float(end) for end in ends.split(":"))
+    except ValueError:
+        raise PantographError(f"--position is JOINT=low:high, not {text!r}") from None
+    return name, (low, high)
 
 
 def _limit(what: str, texts: list[str]) -> dict[str, float]:

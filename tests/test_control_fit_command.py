@@ -1,0 +1,183 @@
+"""The command `pantograph fit`: what it writes, what it judges by, what it says."""
+
+import re
+import tomllib
+
+import mujoco
+import numpy as np
+import pytest
+from pantograph.controllers.fit import fit
+from pantograph.controllers.fit.keys import as_keys
+from pantograph.controllers.fit.task import task_of
+from pantograph.controllers.nominal import difference
+from pantograph.sim import PantographError, Scene, load, make_plan, parse_scene
+from pantograph.sim.cli.template import TEMPLATE
+from pantograph.sim.clip import Clip, FreeTrack
+from pantograph.sim.curves import keyed
+from pantograph.sim.rotation_curves import keyed_rotation
+from pantograph.sim.rotations import exp, multiply, normalize
+from pantograph.sim.scene.load import load_scene
+from pantograph.sim.scene.motion import curves
+from pantograph.sim.scene.schema import KeysItem
+from typer.testing import CliRunner
+
+FLOAT = mujoco.MjModel.from_xml_string(
+    """<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/><body pos=".3 0 0">
+    <joint name="ball" type="ball"/><geom size=".1"/><body pos=".3 0 0"><joint name="hinge"/>
+    <geom size=".1"/></body></body></body></worldbody></mujoco>"""
+)
+
+
+def command():
+    import typer
+    from pantograph.controllers.fit_command import fit as made
+
+    app = typer.Typer()
+    app.command()(made)
+    return app
+
+
+LATE = """duration = 2.0
+[[models]]
+file = "planar_2r"
+[[keys]]
+joint = "shoulder"
+times = [0.5, 1.5]
+values = [-1.0, 0.5]
+[[keys]]
+joint = "elbow"
+times = [0.5, 1.5]
+values = [0.5, 1.5]
+[fit]
+hard = [1.5]
+velocity = 2
+"""
+
+
+@pytest.mark.parametrize("how", ["fit", "retime", "nearest"])
+def test_a_wait_before_the_first_key_stays(how, tmp_path):
+    """The motion begins at 0.5 s, is recorded to its end, and its keys are those of a scene."""
+    scene = tmp_path / "late.toml"
+    scene.write_text(LATE)
+    words = [str(scene), "--how", how, "--out", str(tmp_path), "--keys", "new.toml"]
+    words += ["--jerk", "400"] if how == "nearest" else []
+    done = CliRunner().invoke(command(), words)
+    assert done.exit_code == 0, done.output
+    recording = load(tmp_path / "late.fit.npz")
+    waits = recording.t < 0.5
+    np.testing.assert_allclose(recording.q[waits], np.tile([-1.0, 0.5], (waits.sum(), 1)), atol=1e-9)
+    np.testing.assert_allclose(recording.q[-1], [0.5, 1.5], atol=1e-7)
+    assert recording.t[-1] >= 1.5 - (how == "retime")
+    assert np.abs(recording.v).max() <= 2.0 * (1 + 1e-3)
+    begun = LATE.split("[[keys]]")[0]
+    again = parse_scene(begun.replace("2.0", "4.0") + (tmp_path / "new.toml").read_text())
+    keyed_again = make_plan(again).problem.clip
+    np.testing.assert_allclose(keyed_again.evaluate(recording.t).q, recording.q, atol=2e-4)
+    assert np.isfinite(recording.a).all()
+
+
+def test_keys_are_those_of_turns_too():
+    """Ball and free joints, hinges in degrees: read again they are the same motion."""
+    rng = np.random.default_rng(2)
+    turns = [normalize(rng.normal(size=4)) for _ in range(2)]
+    turns[1] = multiply(turns[0], exp(rng.normal(size=3)))
+    tracks = {
+        "root": FreeTrack(keyed([0, 1], rng.normal(size=(2, 3))), keyed_rotation([0, 1], turns)),
+        "ball": keyed_rotation([0, 1], turns[::-1], kind="clamped"),
+        "hinge": keyed([0.2, 0.5, 1], [0.0, 2.0, -1.0]),
+    }
+    clip = Clip(FLOAT, tracks)
+    found = as_keys(clip, degree=True)
+    items = [KeysItem(**item) for item in tomllib.loads(found.text)["keys"]]
+    scene = Scene(duration=1.0, angle="degree", models=[{"file": "arm6"}], keys=items)
+    again, mistakes = curves(scene, FLOAT)
+    assert not mistakes
+    fine = np.linspace(0.0, 1.0, 997)
+    names = {FLOAT.joint(j).name: track for j, track in again.tracks.items()}
+    rows = zip(clip.evaluate(fine).q, Clip(FLOAT, names).evaluate(fine).q, strict=True)
+    error = max(np.abs(difference(FLOAT, *row)).max() for row in rows)
+    assert error <= 1.01 * found.error <= 1.01e-4
+
+
+def test_a_scene_from_new_is_fitted_with_its_own_controller(tmp_path):
+    """A loose ball that nothing keys is no part of the fit; the law of the proof is the scene's."""
+    text = TEMPLATE.split("[[cameras]]")[0].replace("duration = 4.0 ", "duration = 1.0 ")
+    text = re.sub(r"times = \[.*\]", "times = [0, 1]", text)
+    text = re.sub(r"values = \[(-?\d+), (-?\d+).*\]", r"values = [\1, \2]", text)
+    scene = tmp_path / "wave.toml"
+    scene.write_text(text)
+    words = [str(scene), "--how", "fit", "--force", "150", "--velocity", "6", "--out", str(tmp_path)]
+    done = CliRunner().invoke(command(), words)
+    assert done.exit_code == 0, done.output
+    assert "the scene's pd in the loop" in done.output
+    recording = load(tmp_path / "wave.fit.npz")
+    assert not recording.v[:, -6:].any()  # the ball's
+
+
+def test_a_proof_that_fails_is_told_and_counts(tmp_path):
+    """A law too weak to follow: the certificate holds, the proof does not, and the recording is there."""
+    scene = tmp_path / "slack.toml"
+    scene.write_text(
+        LATE.replace("[fit]", '[roles]\ntracked = ["*"]\n[controller]\nlaw = "pd"\nfrequency = 0.2\n[fit]')
+    )
+    done = CliRunner().invoke(command(), [str(scene), "--how", "fit", "--out", str(tmp_path)])
+    assert "certificate to 0.001 holds" in done.output
+    assert "proof to 0.05 rad or m DOES NOT HOLD" in done.output
+    assert done.exit_code == 1
+    assert (tmp_path / "slack.fit.npz").exists()
+    scene.write_text(scene.read_text() + "within = 3.0\n")
+    assert CliRunner().invoke(command(), [str(scene), "--how", "fit", "--out", str(tmp_path)]).exit_code == 0
+
+
+def test_friction_beyond_the_motor_is_found(tmp_path):
+    """4 N m against 5 N m of dry friction: nothing moves, whatever is asked."""
+    (tmp_path / "stuck.xml").write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" axis="0 0 1" frictionloss="5"/>'
+        '<geom size=".1" mass="1" pos=".5 0 0"/></body></worldbody>'
+        '<actuator><motor joint="j" ctrlrange="-4 4"/></actuator></mujoco>'
+    )
+    scene = tmp_path / "stuck.toml"
+    scene.write_text(
+        'duration = 1.0\n[[models]]\nfile = "stuck.xml"\n[[keys]]\njoint = "j"\ntimes = [0, 1]\n'
+        "values = [0, 1.0]\n"
+    )
+    done = CliRunner().invoke(command(), [str(scene), "--how", "check"])
+    assert done.exit_code == 1
+    assert re.search(r"j +force +6\.\d+ +4 ", done.output)
+    for how in ("fit", "retime"):
+        with pytest.raises(PantographError, match=r"friction"):
+            CliRunner().invoke(command(), [str(scene), "--how", how], catch_exceptions=False)
+
+
+def test_a_range_is_kept(tmp_path):
+    """The scene's range of a joint and one given go before the model's."""
+    scene = tmp_path / "late.toml"
+    scene.write_text(LATE + "[fit.position]\nelbow = [-2.0, 1.2]\n")
+    done = CliRunner().invoke(command(), [str(scene), "--how", "check"])
+    assert re.search(r"elbow +position +0\.3 +range +beyond", done.output)
+    words = [str(scene), "--how", "fit", "--out", str(tmp_path), "--position", "elbow=-2:1.4"]
+    found = fit(
+        task_of(load_scene(scene)).clip, task_of(load_scene(scene), position={"elbow": (-2, 1.4)}).machine
+    )
+    assert found.clip.evaluate(np.linspace(0.5, 1.5, 301)).q[:, 1].max() <= 1.4 * (1 + 1e-3)
+    with pytest.raises(PantographError, match=r"0\.1 rad or m beyond the range of 'elbow'"):
+        CliRunner().invoke(command(), words, catch_exceptions=False)
+    with pytest.raises(PantographError, match="JOINT=low:high"):
+        CliRunner().invoke(command(), [*words[:-1], "elbow=2"], catch_exceptions=False)
+
+
+def test_retiming_keeps_the_keyed_speeds_at_the_ends(tmp_path):
+    """[fit] at_rest = false: it moves at the ends, at most as fast as keyed."""
+    scene = tmp_path / "moving.toml"
+    scene.write_text(
+        LATE.replace("values = [0.5, 1.5]\n", 'values = [0.5, 1.5]\ncurve = "linear"\n') + "at_rest = false\n"
+    )
+    words = [str(scene), "--how", "retime", "--acceleration", "9", "--out", str(tmp_path)]
+    speeds = []
+    for _ in range(2):
+        assert CliRunner().invoke(command(), words).exit_code == 0
+        recording = load(tmp_path / "moving.fit.npz")
+        speeds.append(np.abs(recording.v[recording.t >= 0.5][0]).max())
+        scene.write_text(scene.read_text().replace("at_rest = false", "at_rest = true"))
+    assert speeds[0] > 0.5
+    assert speeds[1] == pytest.approx(0.0, abs=0.1)
