@@ -101,7 +101,8 @@ def comes_home(
 
 @dataclass(frozen=True, eq=False)
 class Basin:
-    """Which starts in a plane of two coordinates come home: ``x`` (a,), ``y`` (b,), ``home`` (b, a)."""
+    """Which starts in a plane of two coordinates come home: ``x`` (a,), ``y`` (b,), evenly spaced, and
+    ``home`` (b, a)."""
 
     x: Array
     y: Array
@@ -109,8 +110,8 @@ class Basin:
 
     @property
     def area(self) -> float:
-        """Area of the starts that come home, in units of x times y."""
-        return float(self.home.mean() * np.ptp(self.x) * np.ptp(self.y))
+        """Area of the starts that come home, in units of x times y: each stands for the cell around it."""
+        return float(self.home.sum() * (self.x[1] - self.x[0]) * (self.y[1] - self.y[0]))
 
 
 def map_basin(
@@ -144,5 +145,6 @@ def picture(basin: Basin, names: tuple[str, str]) -> Figure:
     ax.plot(0.0, 0.0, "k+")
     ax.set_xlabel(names[0])
     ax.set_ylabel(names[1])
-    ax.set_title(f"comes home: area {basin.area:.4g}, {basin.home.mean():.1%} of the picture", fontsize=10)
+    says = f"comes home: area {basin.area:.4g}, {basin.home.mean():.1%} of the starts"
+    ax.set_title(f"{says}; all else at rest at the goal", fontsize=10)
     return chart

@@ -68,8 +68,9 @@ class SwingUp:
     ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, every
     ``every`` [s] until the catch has the machine; zero foresight takes the first set. Slides without range
     and hinges alike; slides must stay in their range with ``room`` [m] to spare. Hinges count modulo a turn.
-    Keys of the driven joint play no part. Raises PantographError when the machine has not exactly one driven
-    joint, or no such goal.
+    Keys of the driven joint play no part. Looking ahead takes far longer than a sample (the control bench
+    tells how long): it is planned outside real time. Raises PantographError when the machine has not exactly
+    one driven joint, or no such goal.
     """
 
     def __init__(

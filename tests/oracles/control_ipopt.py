@@ -3,9 +3,16 @@
 import casadi as ca
 import numpy as np
 
+TOLERANT = {
+    "tol": 1e-4, "warm_start_init_point": "yes", "mu_init": 1e-4,
+    "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
+}  # fmt: skip
+"""IPOPT's options for an answer good to about 1 % from a guess that is nearly one."""
 
-def formulate(law):
-    """A solver (x0, reference states, reference forces, guess) -> (forces, cost) of an NMPC's problem."""
+
+def formulate(law, ipopt=None):
+    """A solver (x0, reference, guess) -> (forces, cost) of an NMPC's problem; the cost is infinite where it
+    fails. ``ipopt``: options beside the plain ones."""
     model, n, m, h, c = law.model, law.n, len(law.inputs), ca.SX.sym("h"), law.shooting.weights
     nv = model.nv
     x, u = ca.SX.sym("x", 2 * nv), ca.SX.sym("u", m)
@@ -36,7 +43,8 @@ def formulate(law):
         cost += c.soft[dof] * ca.sum2(over)
     g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U, H))
     problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur, H), "f": cost, "g": g}
-    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
+    plain = {"print_level": 0, "sb": "yes", "tol": 1e-8}
+    options = {"print_time": False, "expand": True, "error_on_fail": False, "ipopt": plain | (ipopt or {})}
     solver = ca.nlpsol("mpc", "ipopt", problem, options)
     free = np.full(2 * nv * (n + 1), np.inf)
     low = np.concatenate([-free, np.tile(c.low, n)])
@@ -47,6 +55,6 @@ def formulate(law):
         guess = np.concatenate([guess_x.ravel(), guess_u.ravel()])
         done = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=0, ubg=0)
         u = np.asarray(done["x"]).ravel()[2 * nv * (n + 1) :].reshape(n, m)
-        return u, float(done["f"])
+        return u, float(done["f"]) if solver.stats()["success"] else np.inf
 
     return solve
