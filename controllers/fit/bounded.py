@@ -21,7 +21,7 @@ from .path import Path
 from .watch import interruptible, watch
 
 Array = NDArray[np.float64]
-Rows = Callable[[Motion], tuple[Array, Array, Array, Array]]
+Rows = Callable[[Motion, Motion], tuple[Array, Array, Array, Array]]
 
 
 class Timed(NamedTuple):
@@ -122,8 +122,12 @@ def _conditions(
     middle, top = r0 + dt * (u0 / 2.0 + dt * j / 8.0), speed
     fast = np.flatnonzero(np.isfinite(top) & (top > 0)).tolist()
     below: list[Any] = [middle[fast] / top[fast] - 1.0] if fast else []
-    for at, bend, v, a in ((along.begin, along.third[0], r0, u0), (along.end, along.third[1], r1, u1)):
-        for x, y, c, e in zip(*(part.T for part in rows(at)), strict=True):
+    sides = (
+        (along.begin, along.end, along.third[0], r0, u0),
+        (along.end, along.begin, along.third[1], r1, u1),
+    )
+    for at, other, bend, v, a in sides:
+        for x, y, c, e in zip(*(part.T for part in rows(at, other)), strict=True):
             size = np.maximum(np.abs(c), 1e-9)
             below.append((x / size) * a + (y / size) * v**2 + (e / size) * v - c / size)
         for dof in np.flatnonzero(np.isfinite(machine.jerk)):
@@ -193,10 +197,13 @@ def _guess(along: Path, machine: Machine, rows: Rows, speed: Array, ends: tuple[
     what pushes along it let it be, and slow near where it rests."""
     n, length = len(along.length), along.length
     top, push, jerk = speed.copy(), np.full(n + 1, np.inf), np.full(n + 1, np.inf)
-    sides = ((along.begin, along.third[0], slice(None, -1)), (along.end, along.third[1], slice(1, None)))
+    sides = (
+        (along.begin, along.end, along.third[0], slice(None, -1)),
+        (along.end, along.begin, along.third[1], slice(1, None)),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        for at, third, cut in sides:
-            x, y, c, e = rows(at)
+        for at, other, third, cut in sides:
+            x, y, c, e = rows(at, other)
             root = (-e + np.sqrt(e**2 + 4.0 * np.maximum(y, 0.0) * c)) / (2.0 * np.maximum(y, 0.0))
             top[cut] = np.fmin(top[cut], np.nanmin(np.where(y > 0, root, c / e), axis=1))
             top[cut] = np.fmin(top[cut], np.cbrt(machine.jerk / np.abs(third)).min(axis=1))

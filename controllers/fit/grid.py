@@ -20,16 +20,17 @@ from ...sim.clip import Clip, Motion
 from ...sim.errors import PantographError
 from .check import rigid
 from .machine import Machine
-from .path import TURN, Corner, Path, corner
+from .path import TURN, Corner, Path, corner, reversals
 
 Array = NDArray[np.float64]
 _FLOOR = 1e-9  # x below this part of its bound counts as standing still when sqrt(x) is bounded
 
 
-def even(clip: Clip, points: int) -> Array:
-    """Times of a clip, ``points`` even pieces and its breaks."""
+def even(clip: Clip, machine: Machine, points: int) -> Array:
+    """Times of a clip, ``points`` even pieces, its breaks, and where joints with friction turn back."""
     breaks = clip.breaks_between(clip.start, clip.end)
     s = np.union1d(np.linspace(clip.start, clip.end, points + 1), breaks)
+    s = np.union1d(s, reversals(clip, machine.rubs))
     return np.asarray(s[np.append(True, np.diff(s) > 1e-9 * (clip.end - clip.start))])
 
 
@@ -64,7 +65,7 @@ class Grid:
         # come the ones that a solution has
         self.signs = np.zeros((0, clip.model.nv))
         if np.isfinite(machine.current):
-            loaded = np.where(machine.ampere > 0, self._lift(begin).weight, 0.0)
+            loaded = np.where(machine.ampere > 0, self._lift(begin, end).weight, 0.0)
             self.signs = np.unique(np.sign(loaded), axis=0)
         self._lay()
         speed = np.maximum(np.abs(begin.v), 1e-150)
@@ -88,7 +89,7 @@ class Grid:
     def _lay(self) -> None:
         """Rows of all limits at both ends of each piece."""
         begin, end = self.ends
-        rows0, rows1 = self.rows(begin), self.rows(end)
+        rows0, rows1 = self.rows(begin, end), self.rows(end, begin)
         # at the end of a piece x has become x + 2 h u
         a1 = rows1[0] + 2.0 * self.h[:, None] * rows1[1]
         self.a, self.b, self.c, self.e = (
@@ -134,8 +135,8 @@ class Grid:
             for k in np.flatnonzero(moves)
         ]
 
-    def rows(self, at: Motion) -> tuple[Array, Array, Array, Array]:
-        """a, b, c, e (n, rows) of the limits at states of the path."""
+    def rows(self, at: Motion, other: Motion) -> tuple[Array, Array, Array, Array]:
+        """a, b, c, e (n, rows) of the limits at one end of pieces of the path, ``other`` their other end."""
         m = self.machine
         a: list[Array] = []
         b: list[Array] = []
@@ -151,27 +152,31 @@ class Grid:
                 add(sign * at.v[:, dof], sign * at.a[:, dof], m.acceleration[dof])
         limited = np.isfinite(m.force_high - m.force_low)
         if limited.any() or np.isfinite(m.current):
-            self._force_rows(at, limited, add)
+            self._force_rows(at, other, limited, add)
         if not a:
             zero = np.zeros(len(at.v))
             add(zero, zero, 1.0)
         return tuple(np.stack(x, axis=1) for x in (a, b, c, e))  # type: ignore[return-value]
 
-    def _lift(self, at: Motion) -> _Lift:
-        """What forces are made of at states of the path, from four inverse dynamics."""
+    def _lift(self, at: Motion, other: Motion) -> _Lift:
+        """What forces are made of at one end of pieces, from four inverse dynamics; where a joint turns back
+        friction is that of the piece."""
         machine, zero = self.machine, np.zeros_like(at.v)
         weight = rigid(Motion(at.q, zero, zero), machine)
         push = rigid(Motion(at.q, zero, at.v), machine) - weight
         forth = rigid(Motion(at.q, at.v, at.a), machine)
         back = rigid(Motion(at.q, -at.v, at.a), machine)
-        moves = np.abs(at.v) > 1e-9 * np.abs(at.v).max(initial=0.0)
+        way = at.v + other.v
+        moves = np.abs(way) > 1e-9 * np.abs(at.v).max(initial=0.0)
         held = np.where(moves, 0.0, machine.friction)
-        dry = np.where(moves, machine.friction * np.sign(at.v), 0.0)
+        dry = np.where(moves, machine.friction * np.sign(way), 0.0)
         return _Lift(push, 0.5 * (forth + back) - weight, 0.5 * (forth - back), weight + dry, held)
 
-    def _force_rows(self, at: Motion, limited: NDArray[np.bool_], add) -> None:  # type: ignore[no-untyped-def]
+    def _force_rows(  # type: ignore[no-untyped-def]
+        self, at: Motion, other: Motion, limited: NDArray[np.bool_], add
+    ) -> None:
         machine = self.machine
-        push, square, drag, weight, held = self._lift(at)
+        push, square, drag, weight, held = self._lift(at, other)
         for dof in np.flatnonzero(limited):
             low, high, top = machine.force_low[dof], machine.force_high[dof], machine.top_speed[dof]
             beyond = np.maximum(weight[:, dof] - high, low - weight[:, dof]) - held[:, dof]
@@ -199,8 +204,8 @@ class Grid:
         machine = self.machine
         u = (0.5 * np.diff(x) / self.h)[:, None]
         tau = []
-        for at, y in zip(self.ends, (x[:-1, None], x[1:, None]), strict=True):
-            push, square, drag, weight, _ = self._lift(at)
+        for k, y in enumerate((x[:-1, None], x[1:, None])):
+            push, square, drag, weight, _ = self._lift(self.ends[k], self.ends[1 - k])
             tau.append(push * u + square * y + drag * np.sqrt(y) + weight)
         every = np.where(machine.ampere > 0, np.concatenate(tau), 0.0)
         over = every[np.abs(every) @ machine.ampere > machine.current * (1.0 + 1e-9)]

@@ -54,6 +54,13 @@ class Machine:
         return bool(limited.any() or not self.driven.all() or np.isfinite(self.current))
 
     @property
+    def rubs(self) -> NDArray[np.bool_]:
+        """Freedoms (nv,) whose dry friction counts: their forces are limited."""
+        limited = np.isfinite(self.force_high - self.force_low)
+        fed = (self.ampere > 0) & np.isfinite(self.current)
+        return np.asarray((self.friction > 0) & self.driven & (limited | fed))
+
+    @property
     def asks_jerk(self) -> bool:
         """Whether any joint has a limit on jerk."""
         return bool(np.isfinite(self.jerk).any())

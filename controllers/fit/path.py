@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from ...models import dof_names
 from ...sim.clip import Clip, Motion
@@ -164,6 +165,20 @@ def _zeros(clip: Clip, low: Array, high: Array) -> Array:
         below = np.sum(at.v * at.a, axis=1) < 0
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return high
+
+
+def reversals(clip: Clip, dofs: NDArray[np.bool_]) -> Array:
+    """Times at which one of the freedoms ``dofs`` (nv,) turns back, where its friction does."""
+    edges = np.concatenate([[clip.start], clip.breaks_between(clip.start, clip.end), [clip.end]])
+    found = [np.zeros(0)]
+    for a, b in pairwise(edges) if dofs.any() else ():
+        s = np.linspace(a, b, max(12, int(4000 * (b - a) / (clip.end - clip.start))) + 1)[1:-1]
+        v = clip.evaluate(s).v
+        for dof in np.flatnonzero(dofs):
+            for k in np.flatnonzero(v[:-1, dof] * v[1:, dof] < 0):
+                zero = brentq(lambda x, i=dof: clip.evaluate(x).v[i], s[k], s[k + 1], xtol=1e-15)
+                found.append(np.array([zero]))
+    return np.unique(np.concatenate(found))
 
 
 def uneven(clip: Clip, still: list[tuple[float, float]], *, keep: bool) -> bool:

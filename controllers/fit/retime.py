@@ -111,7 +111,7 @@ def retime(
     for name, track in clip.tracks.items():
         if isinstance(track, FreeTrack):
             raise PantographError(f"joint {name!r} is free: no machine moves it along keys; fit the motion")
-    grid = Grid(clip, machine, even(clip, points))
+    grid = Grid(clip, machine, even(clip, machine, points))
     x = grid.fastest(keep, (at_rest, at_rest))
     if np.isfinite(machine.jerk[clip.dofs]).any() or uneven(clip, grid.pauses(), keep=keep):
         at, s, corners = smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points)

@@ -14,7 +14,7 @@ from .charts import Charts
 from .check import by_piece
 from .grid import Grid
 from .machine import Machine
-from .path import Corner, Measure, corners, even_nodes, measure, path, stretches
+from .path import Corner, Measure, corners, even_nodes, measure, path, reversals, stretches
 
 Array = NDArray[np.float64]
 _ROUNDS, _NEAR = 6, 1.002  # of cutting pieces, until limits hold to this between nodes
@@ -60,7 +60,7 @@ def smooth(
     found = corners(clip, np.isfinite(machine.jerk) & clip.dofs, pauses, keep=keep)
     # a program of many variables, or two passes
     points = points // 8 if np.isfinite(machine.jerk[clip.dofs]).any() else points
-    rows = _stretches(clip, found, pauses, x, at_rest, points)
+    rows = _stretches(clip, machine, found, pauses, x, at_rest, points)
     back = [c.s for c in found if c.back]
     most = _MOST * sum(len(row.nodes) for row in rows)
     known: list[Timed | None] = [None] * len(rows)
@@ -78,13 +78,14 @@ def smooth(
 
 def _stretches(
     clip: Clip,
+    machine: Machine,
     found: list[Corner],
     pauses: list[tuple[float, float]],
     x: Array,
     at_rest: bool,
     points: int,
 ) -> list[_Stretch]:
-    parts = stretches(clip, found, pauses)
+    parts, turns = stretches(clip, found, pauses), reversals(clip, machine.rubs)
     total = sum(b - a for a, b, moves in parts if moves)
     ends = clip.evaluate(clip.start).v, clip.evaluate(clip.end, left=True).v
     first, last = (float(np.sqrt(x[k]) * np.linalg.norm(ends[k])) for k in (0, -1))
@@ -99,6 +100,7 @@ def _stretches(
         )
         many = max(24, round(points * (b - a) / total))
         by = measure(clip, a, b, found)
+        by = by._replace(edges=np.union1d(by.edges, turns[(turns > a) & (turns < b)]))
         rows.append(_Stretch(even_nodes(clip, by, many), speeds, by))
     return rows
 
