@@ -50,6 +50,9 @@ def control(
     ] = None,
     trials: Annotated[int, typer.Option(help="Disturbed runs a law.", min=0)] = 8,
     mass: Annotated[float, typer.Option(help="Masses differ by up to this part.", min=0.0)] = 0.1,
+    friction: Annotated[
+        float, typer.Option(help="Damping and dry friction differ by up to this part.", min=0.0, max=1.0)
+    ] = 0.0,
     push: Annotated[
         float, typer.Option(help="Pushes of up to this part of the drives' force.", min=0.0)
     ] = 0.2,
@@ -83,6 +86,7 @@ def control(
             sweep=_swept(sweep or []),
             trials=trials,
             mass=mass,
+            friction=friction,
             push=push,
             seed=seed,
             processes=processes,

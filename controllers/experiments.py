@@ -88,6 +88,7 @@ def compare(
     sweep: Mapping[str, Sequence[Any]] | None = None,
     trials: int = 0,
     mass: float = 0.1,
+    friction: float = 0.0,
     push: float = 0.2,
     seed: int = 0,
     processes: int | None = None,
@@ -95,22 +96,22 @@ def compare(
 ) -> Comparison:
     """Run ``scene`` under each of ``laws``: once as modelled, ``trials`` times disturbed (the same for all).
 
-    A disturbed machine has its masses changed by up to the part ``mass``, each body's on its own, and joint
-    forces of up to ``push`` of what its drives can give (or of its weight, of ideal drives) for a tenth of
-    the scene. ``sweep`` gives lists of parameter values: for every law, each combination of those that it
-    has is a variant; "period" [s] is the controller's own. The scene's own controller parameters go to its
-    own law, to the others those that say what to do (a goal, a site) and those of sensors and drives. The law
-    "ilc" is the scene's own, or ``of``, after ``repeats`` runs from which it learned: on each machine anew,
-    before it is pushed. Undisturbed runs are timed one after the other, those of a sweep and disturbed ones
-    share the processors. Raises SceneError for laws and parameters that do not fit. A script that asks for
-    several processes needs ``if __name__ == "__main__":``; without, a warning says so and one process does it
-    all.
+    A disturbed machine has its masses changed by up to the part ``mass``, each body's on its own, damping and
+    dry friction of its joints by up to the part ``friction``, and joint forces of up to ``push`` of what its
+    drives can give (or of its weight, of ideal drives) for a tenth of the scene. ``sweep`` gives lists of
+    parameter values: for every law, each combination of those that it has is a variant; "period" [s] is the
+    controller's own. The scene's own controller parameters go to its own law, to the others those that say
+    what to do (a goal, a site) and those of sensors and drives. The law "ilc" is the scene's own, or ``of``,
+    after ``repeats`` runs from which it learned: on each machine anew, before it is pushed. Undisturbed runs
+    are timed one after the other, those of a sweep and disturbed ones share the processors. Raises SceneError
+    for laws and parameters that do not fit. A script that asks for several processes needs
+    ``if __name__ == "__main__":``; without, a warning says so and one process does it all.
     """
     if getattr(current_process(), "_inheriting", False):  # as multiprocessing itself asks
         raise PantographError(_GUARD)
     plan = _plan(scene)
     variants = _variants(scene, laws, sweep or {})
-    disturbances = tuple(_disturbances(plan, trials, mass, push, seed))
+    disturbances = tuple(_disturbances(plan, trials, mass, push, seed, friction))
     total = len(variants) * (1 + len(disturbances))
     done = 0
 
@@ -255,7 +256,9 @@ def _check(law: str, base: str, words: Mapping[str, Any]) -> None:
     check_law(str(words.get("of", base)), {w: x for w, x in words.items() if w not in ILC_WORDS})
 
 
-def _disturbances(plan: Plan, trials: int, mass: float, push: float, seed: int) -> list[Disturbance]:
+def _disturbances(
+    plan: Plan, trials: int, mass: float, push: float, seed: int, friction: float = 0.0
+) -> list[Disturbance]:
     m, rng, out = plan.problem.model, np.random.default_rng(seed), []
     tracked = plan.problem.dofs(Role.TRACKED)
     low, high = force_limits(m)
@@ -269,8 +272,10 @@ def _disturbances(plan: Plan, trials: int, mass: float, push: float, seed: int) 
         start = float(rng.uniform(0.1, 0.7) * duration)
         body = int(np.argmax(np.abs(factors - 1.0)))
         heavy = f"{names_of(m, 'body')[body]} x {factors[body]:.3f}"
-        say = f"#{k} of seed {seed}: {heavy}, push at {start:.2f} s"
-        out.append(Disturbance(tuple(factors), tuple(forces), start, start + 0.1 * duration, say))
+        rubs = tuple(1.0 + friction * rng.uniform(-1.0, 1.0, m.nv)) if friction else ()
+        rough = f", friction x {min(rubs):.2f} to {max(rubs):.2f}" if rubs else ""
+        say = f"#{k} of seed {seed}: {heavy}{rough}, push at {start:.2f} s"
+        out.append(Disturbance(tuple(factors), rubs, tuple(forces), start, start + 0.1 * duration, say))
     return out
 
 

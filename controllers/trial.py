@@ -33,11 +33,12 @@ _BAND = 0.02  # of its motion: a joint that stays this near to its last key has 
 class Disturbance:
     """What a trial does to a machine that the law does not know.
 
-    ``mass``: factor a body (nbody,) on mass and inertia; ``push``: joint forces (nv,) [N m, N] from ``start``
-    to ``stop`` [s]; ``say``: in words.
+    ``mass``: factor a body (nbody,) on mass and inertia; ``friction``: factor a freedom (nv,) on damping and
+    dry friction; ``push``: joint forces (nv,) [N m, N] from ``start`` to ``stop`` [s]; ``say``: in words.
     """
 
     mass: tuple[float, ...] = ()
+    friction: tuple[float, ...] = ()
     push: tuple[float, ...] = ()
     start: float = 0.0
     stop: float = 0.0
@@ -184,12 +185,14 @@ def _learned(plan: Plan, true: Problem, words: Mapping[str, Any], period: float)
 
 
 def _disturbed(problem: Problem, disturbance: Disturbance) -> Problem:
-    if not disturbance.mass:
+    if not (disturbance.mass or disturbance.friction):
         return problem
     model = copy.copy(problem.model)
-    factors = np.array(disturbance.mass)
+    factors = np.array(disturbance.mass or 1.0)
     model.body_mass[:] *= factors
-    model.body_inertia[:] *= factors[:, None]
+    model.body_inertia[:] *= factors[..., None]
+    for lossy in (model.dof_damping, model.dof_frictionloss):
+        lossy[:] *= np.array(disturbance.friction or 1.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(problem, model=model)
 

@@ -188,7 +188,7 @@ def test_a_run_that_diverges_is_counted():
     assert lost.status != "done"
     assert "at t = 0." in lost.message
     assert lost.rms == lost.settling == np.inf
-    row = Row(Variant("pd", {}, "pd"), good, (good, lost))
+    row = Row(Variant("pd", {}, "pd"), good, (good, lost), 0.002)
     assert row.failed == 1
     assert row.robust == np.inf
 

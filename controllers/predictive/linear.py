@@ -59,7 +59,8 @@ class MPC:
     ``velocity``, ``force`` and ``goal`` are LQR's. What drives can give is a hard limit, and so is ``slew``
     [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed`` [rad/s, m/s] are soft:
     the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one
-    period each, later ones 2, 4, 8, ...; limits are looked at where moves meet.
+    period each, later ones 2, 4, 8, ...; limits are looked at where moves meet. What drives lose
+    towards their ``top_speed`` is not foreseen.
     """
 
     def __init__(

@@ -46,7 +46,8 @@ class NMPC:
     ``velocity`` and ``force`` weights on deviations from the keys (``goal`` for joints without: joint ->
     value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one costs ``soft``
     times the position weight. Joints ``keyed`` (nv,) are foreseen as they will move. The first sample plans
-    until nothing is left to gain, each later one makes ``iterations`` improvements.
+    until nothing is left to gain, each later one makes ``iterations`` improvements. What drives lose towards
+    their ``top_speed`` is not foreseen.
     """
 
     def __init__(
