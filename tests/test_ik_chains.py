@@ -85,6 +85,42 @@ def test_unreachable_and_absurd_targets_end_without_harm(far):
     assert ik_cases.illegal(model, raced.q[0]) == []
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_targets_that_are_no_numbers_are_refused_and_never_met(bad):
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    for k in range(3):
+        p, R = np.array([0.3, 0.1, 0.4]), np.eye(3)
+        p[k], R[k, 2 - k] = bad, bad
+        with pytest.raises(ModelError, match="p must be finite"):
+            arm(np.eye(3), p)
+        with pytest.raises(ModelError, match="R must be a rotation"):
+            arm(R, [0.3, 0.1, 0.4])
+        for target in ((np.eye(3), p), (R, np.array([0.3, 0.1, 0.4]))):  # past the check
+            assert not arm.racer(arm.middle, *target, tolerance=(1e-6, 1e-6), most=100).met.any()
+    with pytest.raises(ModelError, match="seed must be finite"):
+        arm(np.eye(3), [0.3, 0.1, 0.4], seed=np.full(6, bad))
+
+
+def test_only_rotations_of_the_right_shape_are_targets():
+    model = load_model("arm6")
+    arm = ChainSolver(model, "tip")
+    R, p = _targets(model, "tip", 4)
+    wrong = [2 * np.eye(3), -np.eye(3), np.zeros((3, 3)), np.diag([1, 1, -1]), np.eye(3)[[1, 0, 2]],
+             np.eye(3) + 1e-3 * np.ones((3, 3)), [[1, 0, 0], [0, 1, 0], [0, 1, 0]]]  # fmt: skip
+    for each in wrong:
+        many = R.copy()
+        many[2] = each
+        for target, place in ((each, p[0]), (many, p)):
+            with pytest.raises(ModelError, match="R must be a rotation"):
+                arm(target, place)
+    assert ChainSolver(model, "tip", rotation=False)(np.zeros((3, 3)), p[0]).met.all()  # R is not asked
+    assert arm(np.round(R, 7), p).met.all()  # as printed
+    for words, args in (("R", (np.eye(4), p[0])), ("p", (R, p[:, :2])), ("seed", (R, p, np.zeros(5)))):
+        with pytest.raises(ModelError, match=f"{words} must have the shape"):
+            arm(*args[:2], seed=args[2] if len(args) > 2 else None)
+
+
 def test_one_call_and_a_batch_agree_and_repeat():
     model = load_model("arm6")
     arm = ChainSolver(model, "tip")

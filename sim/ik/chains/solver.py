@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -24,6 +25,7 @@ from .race import Raced, Racer, racer
 from .step import Chain, fits
 
 Array = NDArray[np.float64]
+_ORTHONORMAL = 1e-5
 _MOST = 1000  # iterations a start, of which few take fifty
 
 
@@ -155,10 +157,40 @@ class ChainSolver:
         tolerance: float = 1e-6,
         most: int = 8000,
     ) -> Raced:
-        """Joint values (k, n) for R (k, 3, 3), p (k, 3) [m]; `tolerance` of every component [m, rad]."""
+        """Joint values (k, n) for R (k, 3, 3), p (k, 3) [m]; `tolerance` of every component [m, rad].
+
+        ModelError for an R that is no rotation within 1e-5, and for p or `seed` that are not finite.
+        """
+        R, p = np.asarray(R, dtype=float), np.asarray(p, dtype=float)
         start = np.asarray(self.middle if seed is None else seed, dtype=float)
+        self._check(R, p, start)
         raced = self.racer(start, R, p, tolerance=(tolerance, tolerance), most=most)
         if not self._endless.any():
             return raced
         turns = 2 * np.pi * np.round((raced.q - start) / (2 * np.pi))
         return raced._replace(q=raced.q - turns * self._endless)
+
+    def _check(self, R: Array, p: Array, seed: Array) -> None:
+        for name, x, shape in (("R", R, (3, 3)), ("p", p, (3,)), ("seed", seed, (self.chain.n,))):
+            if x.shape[-len(shape) :] != shape:
+                raise ModelError(f"{name} must have the shape {shape} or (k, {str(shape)[1:]}, not {x.shape}")
+        for name, x in (("p", p), ("seed", seed)):
+            if not math.isfinite(x.sum()):
+                raise ModelError(f"{name} must be finite numbers, not {x}")
+        if self.chain.rotation and (far := _from_rotation(R)) is not None:
+            raise ModelError(
+                f"R must be a rotation (orthonormal, of determinant 1), not {R.reshape(-1, 3, 3)[far]}"
+            )
+
+
+def _from_rotation(R: Array) -> int | None:
+    """Index of the first of R (k, 3, 3) that is further than 1e-5 from a rotation, or None."""
+    rows = R.reshape(-1, 9)
+    # numbers of one, arrays of many: live use asks for one at a time
+    a, b, c, d, e, f, g, h, i = rows[0].tolist() if len(rows) == 1 else rows.T
+    off = abs(a * a + b * b + c * c - 1) + abs(d * d + e * e + f * f - 1) + abs(a * d + b * e + c * f)
+    off = off + abs(b * f - c * e - g) + abs(c * d - a * f - h) + abs(a * e - b * d - i)
+    if len(rows) == 1:
+        return None if off < _ORTHONORMAL else 0
+    bad = np.flatnonzero(~(off < _ORTHONORMAL))
+    return int(bad[0]) if len(bad) else None

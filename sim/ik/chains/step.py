@@ -108,6 +108,7 @@ def _residual(chain: Chain, q: Vector, t: Vector) -> tuple[Vector, Scalar, list[
         share = 1.0 / t[13]
         for x in turn:
             error = maximum(error, absolute(x) * share)
+    error = maximum(error, 1e-30 * dot(e, e))  # the larger of two is the second where one is NaN
     J = []
     for joint, (axis, origin) in zip(chain.frame.joints, at_joints, strict=True):
         column: Vector = []
