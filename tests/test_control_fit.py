@@ -1,9 +1,11 @@
 """Motion against machines: what is impossible is found, and retimed motion is possible and the fastest."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pantograph.controllers.fit import Phase, check, machine, retime
 from pantograph.controllers.fit.check import follow, forces
@@ -367,6 +369,28 @@ def test_friction_opposes_the_way_and_helps_to_brake(way, force, sign):
     assert best * (1 - 1e-6) <= found.duration <= best * 1.01
     shares = check(found.clip, able).uses
     assert {use.who: use.share for use in shares}["x"] == pytest.approx(1.0, abs=1e-3)
+
+
+@given(seeds)
+@example(4)  # a turn right where the force is all there is
+@settings(max_examples=10)
+def test_friction_turns_where_joints_turn_back(seed):
+    """By MuJoCo's inverse dynamics, dense around each turn; nothing has to be slowed as a whole for it."""
+    model = copy.copy(ARM)
+    model.dof_frictionloss[:] = friction = np.array([20.0, 8.0])
+    clip, limit = Clip(model, arm_clip(seed).tracks, model.qpos0), np.array([110.0, 40.0])
+    able = machine(model, velocity=3.0, force=dict(zip(NAMES, limit, strict=True)))
+    found = retime(clip, able, points=300)
+    assert found.slowed < 1.003
+    t = np.linspace(0, found.duration, 3001)[1:-1]
+    v = found.clip.evaluate(t).v
+    turns = t[:-1][(v[1:] * v[:-1] < 0).any(axis=1)]
+    t = np.concatenate([t, *(turns[:, None] + np.linspace(0, t[1] - t[0], 60)).reshape(-1, 60)])
+    data = mujoco.MjData(able.model)
+    for q, v, a in zip(*found.clip.evaluate(t), strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, v, a
+        mujoco.mj_inverse(able.model, data)
+        assert (np.abs(data.qfrc_inverse + friction * np.sign(v)) <= limit * (1 + 1e-6)).all()
 
 
 def test_what_friction_forbids_and_what_it_holds():
