@@ -381,7 +381,7 @@ def test_friction_turns_where_joints_turn_back(seed):
     clip, limit = Clip(model, arm_clip(seed).tracks, model.qpos0), np.array([110.0, 40.0])
     able = machine(model, velocity=3.0, force=dict(zip(NAMES, limit, strict=True)))
     found = retime(clip, able, points=300)
-    assert found.slowed < 1.003
+    assert found.slowed < 1.02
     t = np.linspace(0, found.duration, 3001)[1:-1]
     v = found.clip.evaluate(t).v
     turns = t[:-1][(v[1:] * v[:-1] < 0).any(axis=1)]
