@@ -1,4 +1,4 @@
-"""Retiming by toppra, run by its own environment: reads paths and limits (JSON), prints its results.
+"""Retiming by toppra, in its own environment: reads batches of paths and limits, prints results (JSON).
 
 Interpreted by another Python than ours: it must not import pantograph.
 """
@@ -38,13 +38,15 @@ def retime(times, keys, velocity, acceleration, points, fine):
 
 
 def main():
-    job = json.load(sys.stdin)
-    limits = np.array(job["velocity"]), np.array(job["acceleration"])
-    rows = []
-    for keys in job["paths"]:
-        row = [retime(np.array(job["times"]), np.array(keys), *limits, n, 10 * n + 1) for n in job["points"]]
-        rows.append(row)
-    json.dump(rows, sys.stdout)
+    """A line for each batch of paths, answered by a line."""
+    for line in sys.stdin:
+        job = json.loads(line)
+        limits = np.array(job["velocity"]), np.array(job["acceleration"])
+        rows = []
+        for keys in job["paths"]:
+            at = np.array(job["times"]), np.array(keys)
+            rows.append([retime(*at, *limits, n, 10 * n + 1) for n in job["points"]])
+        print(json.dumps(rows), flush=True)
 
 
 main()
