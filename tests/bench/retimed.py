@@ -18,8 +18,8 @@ EPS = 4.0 * np.finfo(float).eps
 
 class Judged(NamedTuple):
     """By how much limits are exceeded at least at worst, relative; the part of the time on which rounding of
-    positions hides more than 2e-7 of that, and where forces are not judged; how far [rad] beginnings of pieces
-    are from the spline through the keys."""
+    positions hides more than 2e-7 of that, and where forces are not judged; how far [rad] beginnings of
+    pieces are from the spline through the keys."""
 
     excess: float
     rough: float
