@@ -88,6 +88,7 @@ class Loop:
         self.model = model
         self.counts = positive("encoder", encoder, zero=True)
         self.backlash = per_joint(model, "backlash", backlash)
+        self._plays = bool(self.backlash.any())
         self.late = int(np.ceil(positive("delay", delay, zero=True) / period - 1e-9))
         self.drives = Drives(model, tracked, saturation, top_speed)
         self.friction = per_joint(model, "friction", friction, tracked=tracked)
@@ -99,7 +100,7 @@ class Loop:
         if learned:
             self.law = Fed(law, load_learned(learned, model.nv, period), period)
         self.keyed = np.zeros(model.nv, dtype=bool) if keyed is None else keyed
-        self.keyed_q = np.zeros(model.nq, dtype=bool)
+        self.keyed_q, self._any_keyed = np.zeros(model.nq, dtype=bool), bool(self.keyed.any())
         for joint in np.unique(model.dof_jntid[self.keyed]):
             ends = (*model.jnt_qposadr, model.nq)
             self.keyed_q[ends[joint] : ends[joint + 1]] = True
@@ -140,11 +141,11 @@ class Loop:
     ) -> tuple[Array, LoopMemory]:
         """Joint forces (nv,) that arrive now; see :class:`~pantograph.sim.control.Law`."""
         y, middles = self._measure(q, memory.middles)
-        y = np.where(self.keyed_q, target.q, y) if self.keyed.any() else y
+        y = np.where(self.keyed_q, target.q, y) if self._any_keyed else y
         seen, q_seen, v_seen = memory.observer, y, v
         if self.observer is not None:
-            seen = self.observer.update(seen, t, y, memory.applied, target if self.keyed.any() else None)
-            q_seen, v_seen = seen.q, np.where(self.keyed, target.v, seen.v) if self.keyed.any() else seen.v
+            seen = self.observer.update(seen, t, y, memory.applied, target if self._any_keyed else None)
+            q_seen, v_seen = seen.q, np.where(self.keyed, target.v, seen.v) if self._any_keyed else seen.v
         tau, inner = self.law(t, q_seen, v_seen, target, memory.law)
         queue, rotors = (*memory.queue, tau), memory.rotors
         given, cut = self._drive(queue[0], v)
@@ -160,10 +161,12 @@ class Loop:
 
     def _measure(self, q: Array, play: Array | None) -> tuple[Array, Array | None]:
         """What the encoders show, (nq,), and where the middles of the plays are now."""
+        if not (self.counts or self._plays):
+            return q, play
         m, y = self.model, q.copy()
         scalar = np.flatnonzero(np.isin(m.jnt_type, SCALAR))
         at, dof = m.jnt_qposadr[scalar], m.jnt_dofadr[scalar]
-        if self.backlash.any():
+        if self._plays:
             half = 0.5 * self.backlash[dof]
             play = y[at] if play is None else np.clip(play, y[at] - half, y[at] + half)
             y[at] = play
