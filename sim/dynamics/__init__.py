@@ -1,5 +1,6 @@
 """Smooth dynamics: the equations of motion of a MuJoCo model, written once and turned into machine code."""
 
+from .autograd import TorchDynamics, differentiable
 from .laws import LinearFeedback, joint_pd
 from .machine import Stats
 from .motion.path import STATUS, Path
@@ -18,8 +19,10 @@ __all__ = [
     "Stats",
     "StepDerivatives",
     "Stepper",
+    "TorchDynamics",
     "compile_model",
     "differences",
+    "differentiable",
     "joint_pd",
     "unsupported",
 ]
