@@ -808,6 +808,51 @@ def test_shapes_that_do_not_fit_are_named():
         smooth.integrate(np.zeros(2), np.zeros(2), [0.0, 1.0], method=TABLEAUS["rk4"])
 
 
+def test_arguments_that_make_no_sense_are_named():
+    smooth, q, v = compile_model(of_text(SWING), cache=None), np.array([0.3, 0.1]), np.zeros(2)
+    times = [0.0, 0.1]
+    for bad in (-1.0, 0.0, np.nan, np.inf):
+        with pytest.raises(EngineError, match="atol must be positive"):
+            smooth.integrate(q, v, times, rtol=bad)
+        with pytest.raises(EngineError, match="atol must be positive"):
+            smooth.integrate(q, v, times, rtol=1e-6, atol=bad)
+        with pytest.raises(EngineError, match=r"step=.*positive"):
+            smooth.rollout(q, v, step=bad, steps=10)
+        with pytest.raises(EngineError, match=r"step=.*positive"):
+            smooth.step_derivatives(q, v, step=bad)
+        with pytest.raises(EngineError, match=r"first_step=.*positive"):
+            smooth.integrate(q, v, times, first_step=bad)
+        with pytest.raises(EngineError, match=r"hold=.*positive"):
+            smooth.integrate(q, v, times, hold=bad)
+    with pytest.raises(EngineError, match="doubles"):
+        smooth.integrate(q, v, times, rtol=1e-17)
+    for bad in (0, -5):
+        with pytest.raises(EngineError, match="positive number of steps"):
+            smooth.rollout(q, v, step=1e-3, steps=bad)
+    for bad in ([0.0, np.nan], [0.0, np.inf], [0.1, 0.0]):
+        with pytest.raises(EngineError, match="ascending, finite"):
+            smooth.integrate(q, v, bad)
+
+
+def test_one_tolerance_stands_for_both():
+    smooth, times = compile_model(of_text(SWING), cache=None), [0.0, 0.5]
+    both = smooth.integrate([0.3, 0.1], [0.0, 0.0], times, rtol=1e-9, atol=1e-9).x
+    for one in ({"rtol": 1e-9}, {"atol": 1e-9}):
+        np.testing.assert_array_equal(smooth.integrate([0.3, 0.1], [0.0, 0.0], times, **one).x, both)
+
+
+def test_methods_have_names():
+    smooth, q, v = compile_model(of_text(SWING), cache=None), np.array([0.3, 0.1]), np.zeros(2)
+    for run in (
+        lambda method: smooth.rollout(q, v, step=1e-2, steps=10, method=method).x,
+        lambda method: smooth.integrate(q, v, [0.0, 0.1], method=method).x,
+        lambda method: smooth.step_derivatives(q, v, step=1e-2, method=method).x,
+    ):
+        np.testing.assert_array_equal(run("bosh3"), run(TABLEAUS["bosh3"]))
+        with pytest.raises(EngineError, match=r"did you mean 'dopri5'.*verner98"):
+            run("dopri")
+
+
 # ---- what it cannot do, what it does otherwise, what it keeps
 
 

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..compile.cache import Cache, default_folder
 from ..errors import EngineError
+from ..integrate.control import length_of_time, tolerances
 from ..integrate.tableau import Tableau
-from ..integrate.tableaus import DOPRI5, RK4
+from ..integrate.tableaus import DOPRI5, RK4, tableau_of
 from .fields import Parameter, parameter_index
 from .laws import LinearFeedback
 from .layout import Keyed, Layout, keyed_joints
@@ -74,6 +75,9 @@ def compile_model(
     with generalized forces on the state's freedoms; `lanes` fixes the states computed side by side in a batch
     (default: what the processor is best at); `threads` limits those used for batches; `cache` is the folder
     of compiled code (True: the user's, None or False: none).
+
+    Limits of joints and tendons are no part of these equations, nor is dry friction without a width:
+    `Smooth.differences` names what is left out. Runs of scenes locate joint limits and choose a width.
 
     Raises EngineError naming everything in the model that the engine cannot do.
     """
@@ -185,7 +189,7 @@ class Smooth(Machine):
         *,
         step: float,
         steps: int,
-        method: Tableau = RK4,
+        method: str | Tableau = RK4,
         hold: int | None = None,
         every: int = 1,
         act0: ArrayLike | None = None,
@@ -195,12 +199,18 @@ class Smooth(Machine):
     ) -> Path:
         """Integrate in `steps` steps of `step` seconds by an explicit Runge-Kutta `method`, compiled whole.
 
+        Joints go through their limits here: a run of a scene stops them (see `differences`).
+
         `controls` are an array, (nu,), (periods, nu) or (batch, periods, nu); a `LinearFeedback`; or a
         function (t, q, v) -> u, called from Python at the start of each period. They are held over `hold`
         steps (default: 1, or the whole span for a single row). Every `every` steps the state is recorded.
         `w` prescribes the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), evaluated at the
-        stages' times. Raises EngineError for shapes that do not fit.
+        stages' times. `method` is a name of `TABLEAUS` or a tableau. Raises EngineError for shapes that do
+        not fit, a method that does not exist, and steps that are none.
         """
+        tableau, step = tableau_of(method, where="rollout"), length_of_time("step", step)
+        if steps < 1:
+            raise EngineError(f"steps={steps} are none: give a positive number of steps")
         if hold is None:
             sampled = isinstance(controls, LinearFeedback) or callable(controls)
             one_row = not sampled and (controls is None or np.ndim(controls) == 1)  # type: ignore[arg-type]
@@ -210,7 +220,7 @@ class Smooth(Machine):
             raise EngineError(f"{name} is {value} steps, which must divide the {steps} steps of the run")
         start = initial_states(self, q0, v0, act0)
         return fixed(
-            self, start, method=method, step=float(step), steps=steps, controls=controls, hold=hold,
+            self, start, method=tableau, step=step, steps=steps, controls=controls, hold=hold,
             every=every, w=w, p=p, t0=t0,
         )  # fmt: skip
 
@@ -221,9 +231,9 @@ class Smooth(Machine):
         t_eval: ArrayLike,
         controls: Controls = None,
         *,
-        method: Tableau = DOPRI5,
-        rtol: float = 1e-6,
-        atol: float | Array = 1e-6,
+        method: str | Tableau = DOPRI5,
+        rtol: float | None = None,
+        atol: float | Array | None = None,
         hold: float | None = None,
         act0: ArrayLike | None = None,
         w: Prescribed = None,
@@ -234,21 +244,29 @@ class Smooth(Machine):
     ) -> Path:
         """Integrate from t_eval[0] to t_eval[-1] with steps that follow the tolerances, compiled whole.
 
-        The states at `t_eval` [s] (ascending) come from the method's continuous extension. `controls` as for
-        `rollout`, held over `hold` seconds (None: the whole span; a function needs a number). `w` prescribes
+        Joints go through their limits here: a run of a scene stops them (see `differences`). A missing one
+        of `rtol` and `atol` equals the other; both are 1e-6 by default. `method` is a name of `TABLEAUS` or a
+        tableau. The states at `t_eval` [s] (ascending) come from the method's continuous extension.
+        `controls` as for `rollout`, held over `hold` seconds (None: the whole span; a function needs a
+        number). `w` prescribes
         the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), which is taken over as
         polynomials; no step crosses its `breaks` [s], where it or a derivative jumps (found where they are
         not given), and prescribed velocities that jump pull the others along. A batch shares them. Events of
         one's own are found by `sim.integrate.solve(smooth.problem(u), ..., events=...)`. Raises EngineError
-        for shapes that do not fit and for a method without an error estimate.
+        for shapes that do not fit, for tolerances and times that are none, and for a method that does not
+        exist or does not estimate its error.
         """
+        tableau, (relative, absolute) = tableau_of(method, where="integrate"), tolerances(rtol, atol)
         times = np.ascontiguousarray(t_eval, dtype=np.float64)
-        if times.ndim != 1 or len(times) < 2 or not (times[1:] > times[:-1]).all():
-            raise EngineError("t_eval must hold two or more ascending times")
+        if times.ndim != 1 or len(times) < 2 or not (times[1:] > times[:-1]).all() or np.isinf(times).any():
+            raise EngineError("t_eval must hold two or more ascending, finite times")
+        for name, value in (("hold", hold), ("first_step", first_step)):
+            if value is not None:
+                length_of_time(name, value)
         start = initial_states(self, q0, v0, act0)
         return adaptive(
-            self, start, times, method=method, rtol=float(rtol), atol=atol, controls=controls, hold=hold, w=w,
-            breaks=breaks, p=p, first_step=first_step, max_steps=max_steps,
+            self, start, times, method=tableau, rtol=relative, atol=absolute, controls=controls, hold=hold,
+            w=w, breaks=breaks, p=p, first_step=first_step, max_steps=max_steps,
         )  # fmt: skip
 
     def step_derivatives(
@@ -258,7 +276,7 @@ class Smooth(Machine):
         u: ArrayLike | None = None,
         *,
         step: float,
-        method: Tableau = RK4,
+        method: str | Tableau = RK4,
         act: ArrayLike | None = None,
         w: Prescribed = None,
         p: ArrayLike | None = None,
@@ -268,8 +286,9 @@ class Smooth(Machine):
 
         One state (1-D arrays) or a batch; `w` prescribes the keyed joints as for `rollout`, from `t0` on.
         """
+        tableau, step = tableau_of(method, where="step_derivatives"), length_of_time("step", step)
         start = initial_states(self, q, v, act)
-        return step_derivatives(self, start, u, step=step, method=method, w=w, p=p, t0=t0)
+        return step_derivatives(self, start, u, step=step, method=tableau, w=w, p=p, t0=t0)
 
     def problem(
         self, controls: ArrayLike | PythonLaw | None = None, *, w: Prescribed = None

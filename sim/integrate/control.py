@@ -1,5 +1,6 @@
 """Choice of the steps: a fixed grid, or lengths that follow a tolerance."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -206,11 +207,22 @@ def tolerances(rtol: float | None, atol: float | Array | None) -> tuple[float, A
     if rtol is None:
         rtol = 1e-6 if atol is None else float(np.min(atol))
     absolute = np.asarray(rtol if atol is None else atol, dtype=np.float64)
-    if not (rtol >= 0 and np.all(absolute > 0)):
-        raise EngineError(f"rtol={rtol}, atol={atol}: atol must be positive and rtol not negative")
+    if not (0 <= rtol < np.inf and np.all((absolute > 0) & (absolute < np.inf))):
+        raise EngineError(f"rtol={rtol}, atol={atol}: atol must be positive, rtol not negative, both finite")
     if 0 < rtol < 10 * EPS:
         raise EngineError(f"rtol={rtol} is below what doubles resolve: give at least {10 * EPS:.1e}")
     return rtol, absolute
+
+
+def length_of_time(name: str, value: float) -> float:
+    """`value`, a positive number of seconds.
+
+    Raises:
+        EngineError: it is none.
+    """
+    if not (math.isfinite(value) and value > 0):
+        raise EngineError(f"{name}={value} is not a length of time: give a positive number of seconds")
+    return float(value)
 
 
 def fixed_grid(span: tuple[float, float], step: float) -> Array:
@@ -220,8 +232,7 @@ def fixed_grid(span: tuple[float, float], step: float) -> Array:
         EngineError: the step is not a positive number.
     """
     t0, t1 = span
-    if not (np.isfinite(step) and step > 0):
-        raise EngineError(f"step={step} is not a length of time: give a positive number of seconds")
+    step = length_of_time("step", step)
     count = max(1, int(np.ceil(abs(t1 - t0) / step - 1e-9)))
     grid = t0 + np.copysign(step, t1 - t0) * np.arange(count + 1)
     grid[-1] = t1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import EngineError, unknown
+from ..errors import EngineError
 from .control import AdaptiveSteps, End, FixedSteps, steps_for
 from .events import Crossing, Event, Watch
 from .peers import PEERS, solve_by_peer
@@ -15,7 +15,7 @@ from .problems import Problem
 from .solution import Occurrence, Solution, Stats, Status
 from .steps import Counted, Interpolant, Step
 from .tableau import EPS, Array, Tableau
-from .tableaus import TABLEAUS
+from .tableaus import tableau_of
 
 ACCUMULATION = 1e-8
 """A jump that recurs within this fraction of the time span has come to rest."""
@@ -83,7 +83,8 @@ def solve(
             events=events,
             dense=dense,
         )
-    tableau = _tableau(method)
+    foreign = [f"{peer}:{name}" for peer, names in PEERS.items() for name in names]
+    tableau = tableau_of(method, where="solve", others=foreign)
     control = steps_for(tableau, span, step=step, rtol=rtol, atol=atol)
     loop = _Loop(problem, span, tableau, control, events, max_steps)
     solution = loop.run(y0, times, dense=dense)
@@ -114,15 +115,6 @@ def checked_times(t_eval: ArrayLike | None, span: tuple[float, float]) -> Array 
         order = "ascend" if sign > 0 else "descend"
         raise EngineError(f"t_eval must {order}, as the span from {t0} s to {t1} s does")
     return np.clip(times, min(span), max(span))
-
-
-def _tableau(method: str | Tableau) -> Tableau:
-    if isinstance(method, Tableau):
-        return method
-    if method not in TABLEAUS:
-        known = [*TABLEAUS, *(f"{peer}:{name}" for peer, names in PEERS.items() for name in names)]
-        raise EngineError(unknown("method", method, known, where="solve"))
-    return TABLEAUS[method]
 
 
 def _with_error(solution: Solution, finer: Solution, order: int | None) -> Solution:

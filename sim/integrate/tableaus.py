@@ -1,7 +1,9 @@
 """The explicit Runge-Kutta methods that `solve` knows, by name, each an immutable tableau."""
 
+from collections.abc import Iterable
 from types import MappingProxyType
 
+from ..errors import EngineError, unknown
 from .dop853 import DOP853
 from .tableau import Dense, Tableau, frozen, hermite, stages
 from .verner98 import VERNER98
@@ -18,6 +20,7 @@ __all__ = [
     "VERNER98",
     "Dense",
     "Tableau",
+    "tableau_of",
 ]
 
 EULER = Tableau(
@@ -151,3 +154,17 @@ DOPRI5 = Tableau(
 TABLEAUS = MappingProxyType(
     {method.name: method for method in (EULER, HEUN, BOSH3, RK4, RK38, DOPRI5, DOP853, VERNER98)}
 )
+
+
+def tableau_of(method: str | Tableau, *, where: str, others: Iterable[str] = ()) -> Tableau:
+    """The method of that name; `where` is who asks, `others` what it takes beside `TABLEAUS`.
+
+    Raises:
+        EngineError: there is none; the message lists what there is.
+    """
+    if isinstance(method, Tableau):
+        return method
+    found = TABLEAUS.get(method) if isinstance(method, str) else None
+    if found is None:
+        raise EngineError(unknown("method", str(method), [*TABLEAUS, *others], where=where))
+    return found
