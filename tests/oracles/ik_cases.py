@@ -264,6 +264,50 @@ def beyond_slides(rng):
                 joints=(frozenset([f"j{k}"]),), distance=None)  # fmt: skip
 
 
+def beyond_heading(rng):
+    """A planar 3R arm to a place in reach with a heading that leaves the wrist beyond the two bones."""
+    lengths = rng.uniform(0.3, 1.0, 3)
+    bones, hand = lengths[0] + lengths[1], lengths[2]
+    far, turn = rng.uniform(0.8 * bones, bones + 0.95 * hand), rng.uniform(-3, 3)
+    distance, rotation = _apart(bones, hand, far, abs(turn))
+    if min(distance, rotation) < 1e-3:
+        return beyond_heading(rng)
+    angle = rng.uniform(-np.pi, np.pi)
+    goal = Pose("tip", [far * np.cos(angle), far * np.sin(angle), 0], quat_z(angle + turn))
+    return Case("heading apart", planar_chain(lengths), [goal], "out of reach", distance, rotation)
+
+
+def beyond_wrist(rng):
+    """A wrist arm to a place in reach with an orientation that leaves its wrist beyond its two bones."""
+    height, upper, fore, hand = rng.uniform([0.1, 0.3, 0.3, 0.05], [0.4, 0.6, 0.6, 0.2])
+    z, y = (0, 0, 1), (0, 1, 0)
+    ups = [0, height, upper, fore, 0, 0]
+    links = [([0, 0, up], HINGE, axis, None) for up, axis in zip(ups, [z, y, y, z, y, z], strict=True)]
+    far, turn, way = upper + fore + rng.uniform(-0.7, 0.9) * hand, rng.uniform(0.1, 3), unit(rng)
+    distance, rotation = _apart(upper + fore, hand, far, turn)
+    if min(distance, rotation) < 1e-3:
+        return beyond_wrist(rng)
+    aside = np.cross(way, unit(rng))
+    along = np.cos(turn) * way + np.sin(turn) * aside / np.linalg.norm(aside)  # of the hand
+    across = np.cross(along, unit(rng))
+    across /= np.linalg.norm(across)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.column_stack([across, np.cross(along, across), along]).ravel())
+    goal = Pose("tip", far * way, quat)
+    model = chain([*links, ([0, 0, hand], None, None, None)], base=(0, 0, -height))
+    return Case("wrist apart", model, [goal], "out of reach", distance, rotation)
+
+
+def _apart(bones, hand, far, turn):
+    """How far a hand at `far`, turned by `turn` from the way there, leaves its wrist beyond the bones.
+
+    And how far it must turn back until they reach.
+    """
+    distance = np.sqrt(far**2 + hand**2 - 2 * far * hand * np.cos(turn)) - bones
+    cosine = (far**2 + hand**2 - bones**2) / (2 * far * hand)
+    return float(distance), float(turn - np.arccos(np.clip(cosine, -1, 1))) if cosine < 0.999 else 0.0
+
+
 # Held by limits: all solutions are known, and limits exclude each of them.
 
 
@@ -440,7 +484,7 @@ def conflict_beside_an_innocent_goal(rng):
 
 REACHABLE = (reachable_pose, reachable_point, reachable_at_limit, reachable_stretched, reachable_wrist,
              reachable_several)  # fmt: skip
-BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt, beyond_surface)
+BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt, beyond_surface, beyond_heading, beyond_wrist)
 LIMITED = (
     limited_two_links,
     limited_three_links,

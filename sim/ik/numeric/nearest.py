@@ -16,10 +16,11 @@ from ..problem import Problem
 from ..space import Space
 from .descend import Descent, descend, held_projection, solved
 from .search import Search
-from .settle import Wish, settle
+from .settle import Settled, Wish, settle
 
 Array = NDArray[np.float64]
 _CLOSED = 1e3  # residuals of equalities beside those of goals
+_CRAWL = 20  # iterations of Gauss and Newton before those of Newton
 _FIRST = 1e2  # residuals of goals beside those of wishes
 
 
@@ -38,6 +39,24 @@ def brought(search: Search) -> Descent:
     ends = [sharpen(search.problem, q) for q in search.best.q[:4]]
     search.brought = [float(end.cost[0]) for end in ends]
     return min(ends, key=lambda end: float(end.cost[0]))
+
+
+def settle_least(held: Problem, q: Array, wish: Wish) -> Settled:
+    """Least |wish|^2 among what meets `held`, from q (nq,) that does; exact where much of the wish remains.
+
+    The end of `settle` by Newton's method on heavier rows of `held` beside the wish. What these weights leave
+    open is closed along the normals, so that the value is off by the square of that.
+    """
+    end = settle(held, q, wish, iterations=_CRAWL)
+
+    def rows(x: Array) -> Rows:
+        w, k = held.weighted(held.raw(x)), wish(x)
+        parts = zip((_CLOSED * w.r, _CLOSED * w.J), k, strict=True)
+        return Rows(*(np.concatenate(pair, axis=1) for pair in parts))
+
+    back = descend(held, _newton(held, end.q, rows, None, 40)[None], iterations=20)
+    value = float(_square(wish(back.q).r)[0])
+    return Settled(back.q[0], value, end.iterations) if back.met[0] and value < end.value else end
 
 
 def settle_nearest(problem: Problem, end: Descent, wish: Wish, *, iterations: int = 40) -> Array:

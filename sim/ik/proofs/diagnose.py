@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..chains.closed_form import closed_form
 from ..goals import Goal, Orientation, Pose, Position, Rows
 from ..numeric.descend import Descent, descend
-from ..numeric.nearest import brought
+from ..numeric.nearest import brought, settle_least
 from ..numeric.search import Search
 from ..numeric.settle import settle
 from ..problem import Problem, freedom_names, unwound
@@ -243,7 +243,7 @@ def _least(held: Problem, wanted: Problem, search: Search, end: Descent) -> floa
         return wanted.weighted(wanted.raw(x))
 
     value = np.sum(wish(q).r ** 2, axis=1)
-    ends = [settle(held, q[i], wish) for i in np.argsort(value)[:3]]
+    ends = [settle_least(held, q[i], wish) for i in np.argsort(value)[:3]]
     best = min(ends, key=lambda e: e.value)
     position, rotation = _sizes(wanted, wanted.raw(best.q[None]).r)
     return max(position, rotation)
