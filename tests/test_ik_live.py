@@ -192,3 +192,10 @@ def test_a_goal_at_rest_is_held_exactly_by_the_targets():
     model = load_model("arm6")
     tip = frame(model, "site", "tip").pose(target[0][:6])[:3, 3]
     np.testing.assert_allclose(tip, [0.45, 0.1, 0.5], atol=1e-6)
+
+
+@pytest.mark.parametrize("solve", ["live", "baked"])
+def test_an_arm_that_begins_straight_follows_a_goal_inwards_along_it(solve):
+    goal = {"at": "tip", "times": [0, 1, 2], "position": [[1.8, 0, 2], [1.08, 0, 2], [1.08, 0, 2]]}
+    recording = run(Scene(duration=2.0, models=[{"file": "planar_2r"}], goals=[goal | {"solve": solve}]))
+    assert recording.missed[0, 0, 0] < 1e-6 and recording.missed[-1, 0, 0] < 1e-5

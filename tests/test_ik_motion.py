@@ -299,6 +299,80 @@ def test_streaming_keeps_named_geoms_apart():
     assert any("near post" in what for what in held)
 
 
+def _straight(n, d=0):
+    """A planar arm of n links whose first ones point along x, with a turn of 180 degrees after d links."""
+    q = np.zeros(n)
+    if d:
+        q[d] = np.pi
+    return ik_cases.planar_chain([0.5] * n), q
+
+
+LIMITS = pytest.mark.parametrize("limits", [{}, {"velocity": 2.0}, {"velocity": 2.0, "acceleration": 20.0}])
+
+
+@LIMITS
+@pytest.mark.parametrize(("links", "folded"), [(2, 0), (3, 0), (4, 0), (4, 1)])
+def test_a_straight_arm_follows_a_goal_inwards_along_it(links, folded, limits):
+    """J'r = 0 there though r is not: no first-order step moves it."""
+    model, q = _straight(links, folded)
+    goal = Position("tip", 0.5 * ik_cases.pose_of(model, q, "tip")[0])
+    follower = Follower(model, dt=0.01, q0=q, **limits)
+    before = np.zeros(model.nv)
+    for _ in range(400):
+        tick = follower.step([goal])
+        assert np.abs(tick.v).max() <= limits.get("velocity", np.inf) * (1 + 1e-9)
+        assert np.abs(tick.v - before).max() <= 0.01 * limits.get("acceleration", np.inf) * (1 + 1e-6)
+        before = tick.v
+    assert tick.followed and tick.residuals[0].position < 1e-9
+
+
+@LIMITS
+@pytest.mark.parametrize("dt", [0.005, 0.02])
+def test_an_arm_comes_back_from_a_goal_beyond_its_reach_where_it_waits_still(limits, dt):
+    model = wrist_arm()
+    q = np.array([0.0, 0.8, 1.0, 0.0, 0.5, 0.0])
+    p, root = ik_cases.pose_of(model, q, "tip")[0], np.array([0, 0, 0.3])
+    follower = Follower(model, dt=dt, q0=q, **limits)
+    far = root + 1.4 * (p - root) / np.linalg.norm(p - root)
+    away = [follower.step([Position("tip", far)]) for _ in range(round(3 / dt))][-round(1 / dt) :]
+    assert not away[-1].followed
+    assert max(np.abs(tick.q - away[0].q).max() for tick in away) < 1e-6
+    for k in range(round(6 / dt)):
+        share = max(0.0, 1.0 - k * dt)  # back within a second, along the stretched arm
+        tick = follower.step([Position("tip", p + share * (far - p))])
+    assert tick.followed and tick.residuals[0].position < 1e-6
+
+
+def test_an_elbow_at_its_limit_bends_the_way_it_can():
+    links = [([0, 0, 0], ik_cases.HINGE, (0, 0, 1), (-3, 3)), ([0.5, 0, 0], ik_cases.HINGE, (0, 0, 1), None)]
+    for low, high in ((0.0, 2.8), (-2.8, 0.0)):
+        links[1] = (*links[1][:3], (low, high))
+        model = ik_cases.chain([*links, ([0.5, 0, 0], None, None, None)])
+        for words in ({}, {"velocity": 2.0, "acceleration": 30.0}):
+            follower = Follower(model, dt=0.01, q0=[0, 0], **words)
+            for _ in range(300):
+                tick = follower.step([Position("tip", [0.6, 0, 0])])
+            assert tick.followed and ik_cases.illegal(model, tick.q) == []
+
+
+@pytest.mark.parametrize("limits", [{}, {"velocity": 4.0, "acceleration": 60.0}])
+def test_a_whole_motion_that_begins_straight_goes_inwards(limits):
+    for model, q in (_straight(2), _straight(3)):
+        x = ik_cases.pose_of(model, q, "tip")[0]
+        motion = follow(
+            model, lambda s, x=x: [Position("tip", x * (1 - 0.5 * s))], np.linspace(0, 1, 31), q0=q, **limits
+        )
+        assert motion.position[-10:].max() < 1e-4
+        assert motion.position.max() < 0.01  # the first instant asks for infinite speed
+
+
+def test_a_whole_motion_beyond_reach_stays_stretched():
+    model, q = _straight(2)
+    motion = follow(model, lambda s: [Position("tip", [1.2, 0, 0])], np.linspace(0, 1, 31), q0=q)
+    np.testing.assert_allclose(motion.position, 0.2, atol=1e-9)
+    np.testing.assert_allclose(motion.q, 0, atol=1e-6)
+
+
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.integers(1, 8), st.integers(0, 14))
 def test_small_quadratic_programmes_meet_their_optimality_conditions(seed, n, k):

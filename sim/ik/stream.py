@@ -8,7 +8,8 @@
 A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick
 has a velocity that does, too, so that ranges, velocities and accelerations never contradict each other. With
 the same law joints slow down before the configuration that meets the goals, relative to how that moves: a
-goal that jumps is approached without overshoot.
+goal that jumps is approached without overshoot. Where no such step serves, as at a stretched arm whose goal
+lies inwards, the tick goes along a direction of negative curvature (`saddle.py`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from .collision import Clearance, Gap
 from .goals import Goal
 from .numeric.qp import minimise
 from .problem import Problem, freedom_names
+from .saddle import ways_down
 from .series import Series
 from .solve import residuals
 from .space import Space
@@ -39,7 +41,9 @@ _SHARE = 0.5  # of the distance to a geom that a tick may use up
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 4  # linearisations a tick
 _CALM = 0.3  # of the greatest velocity, below which a configuration ahead counts as at rest
-_STRIDE = 0.5  # [rad or m] of one of them in search of where to brake
+_STRIDE = 0.5  # [rad or m] of one of them in search of where to brake, and out of a saddle
+_SHORTER = (1.0, 0.1, 0.01)  # of it, that are tried
+_MOST = 1e6  # damping; that of a tick's first linearisation is at most 1
 
 
 @dataclass(frozen=True)
@@ -133,19 +137,23 @@ class Follower:
         allowed = self._allowed()
         d = np.clip(np.zeros(self.model.nv), low, high)
         here, held = self._at(problem, self.space.step(before[None], d[None])[0], allowed), tuple[str, ...]()
+        self._damping, began = min(self._damping, 1.0), here.cost
         for _ in range(_ITERATIONS):
             trial, why = self._programme(here, columns, d, low, high, allowed)
             there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
             better = there.cost < here.cost
-            self._damping = min(max(self._damping * (0.03 if better else 30.0), _LEAST), 1.0)
+            self._damping = min(max(self._damping * (0.03 if better else 30.0), _LEAST), _MOST)
             held = why if better or not held else held
             if better:
                 gain, here, d = here.cost - there.cost, there, trial
                 if here.cost < _CLOSE or gain < _GAIN * here.cost:
                     break
+        met = bool(problem.met(problem.raw(here.q[None]).r)[0])
+        if not met and began - here.cost <= _GAIN * here.cost:
+            here = self._out_of_saddle(problem, here, d, low, high, allowed)
+            met = bool(problem.met(problem.raw(here.q[None]).r)[0])
         self.q = here.q
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
-        met = bool(problem.met(problem.raw(self.q[None]).r)[0])
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
 
     def _at(self, problem: Problem, q: Array, allowed: list[float]) -> _Point:
@@ -155,8 +163,25 @@ class Follower:
         passed = max((least - gap.distance for gap, least in zip(gaps, allowed, strict=True)), default=0.0)
         r, J = w.r[0], w.J[0]
         cost = float(r @ (r * np.where(problem.judged, 1.0, 1.0 / _HARD))) + 1e3 * max(0.0, passed)
-        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
+        weight = _weights(problem)
         return _Point(q, r * weight, J * weight[:, None], gaps, cost)
+
+    def _out_of_saddle(
+        self, problem: Problem, here: _Point, d: Array, low: Array, high: Array, allowed: list[float]
+    ) -> _Point:
+        """A point beside q + d that costs less, where there is one along negative curvature; else `here`."""
+        before, weight = self.q, _weights(problem)
+        roomy = problem.moved & (low < d) & (d < high)
+        for free in (problem.moved, roomy):
+            for way in ways_down(problem, here.q, weight, free):
+                most = _along(way, d, low, high)
+                for share in _SHORTER:
+                    trial = d + share * most * way
+                    there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
+                    if there.cost < here.cost:
+                        self._damping = _LEAST
+                        return there
+        return here
 
     def _programme(
         self,
@@ -224,8 +249,9 @@ class Follower:
         (nv,), and its velocity (nv,): zero where it has begun to move or jumped."""
         last = self._aim
         aim = self.q if last is None else np.where(self.space.coordinates(problem.moved), last, self.q)
-        weight = np.where(problem.judged, np.sqrt(_HARD), 1.0)
+        weight = _weights(problem)
         w, damping = problem.weighted(problem.raw(aim[None])), self._aim_damping
+        began = float(np.sum((w.r[0] * weight) ** 2))
         for _ in range(_ITERATIONS):
             r, J = w.r[0] * weight, w.J[0] * weight[:, None]
             cost, slope = float(r @ r), J.T @ r
@@ -240,6 +266,9 @@ class Follower:
             better = float(np.sum((w_trial.r[0] * weight) ** 2)) < cost
             damping = min(max(damping * (0.1 if better else 100.0), _LEAST * _HARD), 1e2 * _HARD)
             aim, w = (trial, w_trial) if better else (aim, w)
+        cost = float(np.sum((w.r[0] * weight) ** 2))
+        if began - cost <= _GAIN * cost and not problem.met(problem.raw(aim[None]).r)[0]:
+            aim, damping = self._aside(problem, aim, cost, damping)
         self._aim_damping = damping
         moved: Array = np.zeros(self.model.nv)
         if last is not None:
@@ -247,6 +276,16 @@ class Follower:
         steady = np.abs(moved - self._aim_v) <= np.minimum(self.a_max, 1e6) * self.dt * (1 + 1e-9)
         self._aim, self._aim_v = aim, moved
         return self.space.difference(aim[None], self.q[None])[0], moved, np.where(steady, moved, 0.0)
+
+    def _aside(self, problem: Problem, aim: Array, cost: float, damping: float) -> tuple[Array, float]:
+        """A configuration (nq,) that costs less than `aim` along negative curvature, or that, and damping."""
+        weight = _weights(problem)
+        for way in ways_down(problem, aim, weight, problem.moved):
+            for share in _SHORTER:
+                there = self.space.step(aim[None], share * _STRIDE * way[None])
+                if float(np.sum((problem.weighted(problem.raw(there)).r[0] * weight) ** 2)) < cost:
+                    return there[0], _LEAST * _HARD
+        return aim, damping
 
     def _allowed(self) -> list[float]:
         """Least distance of every pair of geoms after this tick (velocity damper)."""
@@ -271,6 +310,18 @@ class Follower:
         mask[columns[active[active < 2 * n] % n]] = True
         walls = active[(active >= 2 * n) & (active < 2 * n + len(names))] - 2 * n
         return (*freedom_names(self.model, mask), *(names[i] for i in walls))
+
+
+def _weights(problem: Problem) -> Array:
+    """Of a problem's rows (m,): what is judged comes before wishes."""
+    return np.where(problem.judged, np.sqrt(_HARD), 1.0)
+
+
+def _along(way: Array, d: Array, low: Array, high: Array) -> float:
+    """How far [rad or m] a step `d` can be lengthened along a unit direction between `low` and `high`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(way > 0, (high - d) / way, np.where(way < 0, (low - d) / way, np.inf))
+    return max(0.0, min(_STRIDE, float(room[np.abs(way) > 1e-9].min(initial=np.inf))))
 
 
 def limit(name: str, value: ArrayLike | None, nv: int) -> Array:
