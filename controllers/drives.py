@@ -42,12 +42,12 @@ class Drives:
                     "its actuator has no ctrlrange or forcerange"
                 )
 
-        self._slow = bool(np.isfinite(self.top).any())
+        self.slow = bool(np.isfinite(self.top).any())
 
     def at(self, v: Array) -> tuple[Array, Array]:
         """Least and greatest force (nv,) at speeds ``v`` (nv,): a motor gives its whole force against its
         motion, and none beyond its top speed."""
-        if not self._slow:
+        if not self.slow:
             return self.low, self.high
         left = np.clip(1.0 - np.abs(v) / self.top, 0.0, 1.0)
         return np.where(v < 0, left * self.low, self.low), np.where(v > 0, left * self.high, self.high)

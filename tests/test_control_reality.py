@@ -109,6 +109,33 @@ def test_encoders_of_slides_count_metres_and_noise_can_be_told():
 # ---- drives
 
 
+def test_predicted_forces_are_those_that_a_motor_can_give_at_speed():
+    """A cart that has a metre to go, with a motor that has none left at 1 m/s."""
+    scene = Scene(
+        models=[{"file": "cart_pole"}],
+        duration=1.5,
+        roles={"tracked": ["slide"]},
+        keys=[
+            {"joint": "slide", "times": [0, 1.5], "values": [0.0, 0.8], "curve": "clamped"},
+            {"joint": "hinge", "times": [0], "values": [np.pi]},
+        ],
+        initial={"position": {"slide": -0.3}},
+        physics={"limits": False},
+    )
+    problem, used = make_plan(scene).problem, 0.0
+    law = make_law("mpc", problem, {"top_speed": 1.0, "position": 1e4}, 0.01)
+    drives, memory = law.drives, law.start()
+    for k in range(100):
+        q, v = np.array([-0.3 + 0.006 * k, np.pi]), np.array([0.6 + 0.003 * k, 0.0])
+        target = Target(*problem.clip.evaluate(0.01 * k))
+        _, memory = law(0.01 * k, q, v, target, memory)
+        asked = memory.law.u[0]
+        low, high = (limit[0] for limit in drives.at(v))
+        assert low - 1e-9 <= asked <= high + 1e-9
+        used = max(used, asked / high)
+    assert used > 0.999
+
+
 @pytest.mark.parametrize("word", ["friction", "play", "top_speed"])
 def test_what_drives_do_at_joints_without_drives_is_refused(word):
     model = load_model("cart_pole")

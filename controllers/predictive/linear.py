@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ...sim.clip import Clip
 from ...sim.control import Target
-from ..gains import Gain, force_limits, limit_per_joint, positive, whole
+from ..drives import Drives
+from ..gains import Gain, limit_per_joint, positive, whole
 from ..lqr import LQR
 from .quadratic import NOTHING, LeastChange, Rows
 
@@ -60,7 +61,7 @@ class MPC:
     [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed`` [rad/s, m/s] are soft:
     the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one
     period each, later ones 2, 4, 8, ...; limits are looked at where moves meet. What drives lose
-    towards their ``top_speed`` is not foreseen.
+    towards their ``top_speed`` [rad/s, m/s] is foreseen at the speeds that LQR alone would have.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class MPC:
         period: float,
         duration: float,
         keyed: NDArray[np.bool_],
+        top_speed: Gain | None = None,
         *,
         horizon: float = 0.5,
         fine: int = 8,
@@ -89,8 +91,8 @@ class MPC:
         )  # fmt: skip
         self.model, self.inputs, self.moving = model, np.flatnonzero(tracked), np.flatnonzero(~keyed)
         self.powers = _moves(positive("the MPC's horizon", horizon), period, whole("the MPC's fine", fine))
-        low, high = force_limits(model)
-        self.low, self.high = low[self.inputs], high[self.inputs]
+        self.drives = Drives(model, tracked, top_speed=top_speed)
+        self.low, self.high = self.drives.low[self.inputs], self.drives.high[self.inputs]
         self.slew = limit_per_joint(model, "the MPC's slew", slew, tracked=tracked)[self.inputs] * period
         ranges, limited = model.jnt_range[model.dof_jntid], model.jnt_limited[model.dof_jntid].astype(bool)
         top = limit_per_joint(model, "the MPC's speed", speed)
@@ -138,13 +140,14 @@ class MPC:
         error, needed = self.lqr.aim(t, q, v, target)
         kept = np.concatenate([self.moving, self.model.nv + self.moving])
         ahead = self.foresee(t, -error[kept], needed[self.inputs])
-        low, high = self.limits(t, memory.u)
+        able = self.able(t, ahead)
+        low, high = self.limits(t, memory.u, able)
         at = self._rows(ahead.x, ahead.u, memory.u)
         u, held = ahead.u[0], NOTHING
         if (at < low - 1e-12 * (1.0 + abs(low))).any() or (at > high + 1e-12 * (1.0 + abs(high))).any():
             M, give, scale = self.program(ahead, first=memory.u is None)
             z, held, _ = self.least_change(M, low - at, high - at, give, memory.held)
-            u = np.clip(u + scale @ z[: len(u)], *self._now(memory.u))
+            u = np.clip(u + scale @ z[: len(u)], *self._now(memory.u, able))
         tau = np.zeros(self.model.nv)
         tau[self.inputs] = u
         return tau, MPCMemory(u, held)
@@ -165,23 +168,42 @@ class MPC:
         us[0] += needed - u_d[at[0]]
         return Ahead(at, xs, us)
 
-    def limits(self, t: float, before: Array | None) -> tuple[Array, Array]:
+    def able(self, t: float, ahead: Ahead) -> tuple[Array, Array]:
+        """Least and greatest force (b, m) of the drives at the beginnings of the moves."""
+        b = len(self.powers)
+        if not self.drives.slow:
+            return np.tile(self.low, (b, 1)), np.tile(self.high, (b, 1))
+        first = max(round(t / self.lqr.period), 0)
+        at = first + np.concatenate([[0], np.cumsum(2 ** np.array(self.powers[:-1]))]).astype(int)
+        v = self.speeds[np.minimum(at, len(self.speeds) - 1)].copy()
+        v[:, self.moving] += ahead.x[:-1, len(self.moving) :]
+        low, high = self.drives.at(v)
+        return low[:, self.inputs], high[:, self.inputs]
+
+    @cached_property
+    def speeds(self) -> Array:
+        """Velocities that the keys want, (ticks + 1, nv)."""
+        preview = self.lqr.preview
+        return np.asarray(preview.clip.evaluate(np.arange(len(preview.times) + 1) * preview.period).v)
+
+    def limits(self, t: float, before: Array | None, able: tuple[Array, Array]) -> tuple[Array, Array]:
         """Least and greatest value of every row: forces, their changes (moves of one period), states."""
-        b, fine = len(self.powers), self.powers.count(0)
+        fine = self.powers.count(0)
         slew = np.tile(self.slew, fine if before is not None else fine - 1)
         first = max(round(t / self.lqr.period), 0)
         ends = np.minimum(first + np.cumsum(2 ** np.array(self.powers)), len(self.wanted) - 1)
         wanted = self.wanted[ends]
         return (
-            np.concatenate([np.tile(self.low, b), -slew, (self.x_low[self.limited] - wanted).ravel()]),
-            np.concatenate([np.tile(self.high, b), slew, (self.x_high[self.limited] - wanted).ravel()]),
+            np.concatenate([able[0].ravel(), -slew, (self.x_low[self.limited] - wanted).ravel()]),
+            np.concatenate([able[1].ravel(), slew, (self.x_high[self.limited] - wanted).ravel()]),
         )
 
-    def _now(self, before: Array | None) -> tuple[Array, Array]:
+    def _now(self, before: Array | None, able: tuple[Array, Array]) -> tuple[Array, Array]:
         """Hard limits (m,) of the forces now, for what rounding leaves of them."""
+        low, high = able[0][0], able[1][0]
         if before is None:
-            return self.low, self.high
-        return np.maximum(self.low, before - self.slew), np.minimum(self.high, before + self.slew)
+            return low, high
+        return np.maximum(low, before - self.slew), np.minimum(high, before + self.slew)
 
     def _rows(self, x: Array, u: Array, before: Array | None) -> Array:
         """Values of the rows that have limits, for states x (b + 1, ...) and forces u (b, ...)."""
