@@ -54,6 +54,9 @@ def fit(
     with keys and without a drive, at any. What has neither is free at the end. ``step`` [s] is the longest
     piece of the first grid, ``most`` the most iterations on one.
 
+    Dry friction is smoothed below :data:`~.machine.WIDTH`; a drive has to be able to overcome all of it where
+    a joint is as slow, also where it could help to hold.
+
     Up to ``refine`` times, the pieces on which the motion does not hold to ``tolerance`` (limits, and forces
     missing relative to the largest) are cut, and limits are drawn in by what it exceeds them between points;
     the certificate says whether it holds in the end. ``progress`` is told in words what is at work.

@@ -53,6 +53,12 @@ def sites_of(model: mujoco.MjModel, phases: Sequence[Phase]) -> tuple[str, ...]:
     return sites
 
 
+def carried(model: mujoco.MjModel, phases: Sequence[Phase]) -> NDArray[np.bool_]:
+    """Freedoms (nv,) of the mechanisms that rest on the ground in ``phases``."""
+    bodies = [model.site_bodyid[lookup(model, "site", site)] for site in sites_of(model, phases)]
+    return np.asarray(np.isin(model.dof_treeid, model.body_treeid[bodies]))
+
+
 def touching(phases: Sequence[Phase], site: str, t: Array) -> NDArray[np.bool_]:
     """Whether a site touches at times t (n,)."""
     on = np.zeros(len(t), dtype=bool)

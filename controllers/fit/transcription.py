@@ -7,7 +7,6 @@ which decides their forces there; positions and velocities then stay as they wer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from ...sim.clip import Clip
 from ...sim.errors import PantographError
 from ..nominal import difference, moved
 from .charts import Charts
-from .contact import Phase, independent, places, sites_of, touching
+from .contact import Phase, carried, independent, places, sites_of, touching
 from .machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
@@ -76,15 +75,8 @@ def moving(machine: Machine, wish: Wish) -> NDArray[np.bool_]:
     """Freedoms (nv,) that a fit is about: not those of things that nothing keys, drives, or touches in a
     phase, which stay as they are."""
     tree = machine.model.dof_treeid
-    mine = tree[machine.driven | wish.clip.dofs | _carried(machine, wish.phases)]
+    mine = tree[machine.driven | wish.clip.dofs | carried(machine.model, wish.phases)]
     return np.asarray(np.isin(tree, mine))
-
-
-def _carried(machine: Machine, phases: Sequence[Phase]) -> NDArray[np.bool_]:
-    """Freedoms (nv,) of what rests on the ground in ``phases``."""
-    m = machine.model
-    bodies = [m.site_bodyid[lookup(m, "site", site)] for site in sites_of(m, phases)]
-    return np.asarray(np.isin(m.dof_treeid, m.body_treeid[bodies]))
 
 
 class Transcription:
@@ -349,7 +341,7 @@ class Transcription:
         hung on, or left to swing they are not."""
         wish, driven = self.wish, self.machine.driven
         now = [p for p in wish.phases if p.holds(self.t[[k]])[0]]
-        held = driven | _carried(self.machine, now)
+        held = driven | carried(self.model, now)
         if wish.at_rest:
             return held | wish.clip.dofs if k else np.ones(self.model.nv, dtype=bool)
         return held & wish.clip.dofs if k else held | ~wish.clip.dofs

@@ -50,4 +50,6 @@ class FitItem(Item):
     step: Positive = Field(0.04, description="longest piece of the first grid, seconds")
     tolerance: Positive = Field(1e-3, description="of the certificate, relative")
     within: Positive = Field(0.05, description="how far a simulated motion may be from a fitted one, rad, m")
-    at_rest: Switch = Field(True, description="begin and end at rest, else at the keyed velocity")
+    at_rest: Switch = Field(
+        True, description="begin and end at rest, else at the keyed velocity, thrown things at any"
+    )
