@@ -2,14 +2,16 @@
 
 import re
 import tomllib
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
-from pantograph.controllers.fit import fit
+from pantograph.controllers.fit import fit, machine, prove
 from pantograph.controllers.fit.keys import as_keys
 from pantograph.controllers.fit.task import task_of
 from pantograph.controllers.nominal import difference
+from pantograph.models import load_model
 from pantograph.sim import PantographError, Scene, load, make_plan, parse_scene
 from pantograph.sim.cli.template import TEMPLATE
 from pantograph.sim.clip import Clip, FreeTrack
@@ -181,3 +183,39 @@ def test_retiming_keeps_the_keyed_speeds_at_the_ends(tmp_path):
         scene.write_text(scene.read_text().replace("at_rest = false", "at_rest = true"))
     assert speeds[0] > 0.5
     assert speeds[1] == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_body_in_flight_that_nothing_steers_is_proved(tmp_path):
+    """No regulator without end exists for it; the command ends with a proof and with the recording."""
+    (tmp_path / "satellite.xml").write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body><freejoint name="root"/>'
+        '<inertial pos="0 0 0" mass="3" diaginertia=".2 .25 .3"/><body><joint name="wheel" axis="0 0 1"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .02"/></body></body></worldbody></mujoco>'
+    )
+    scene = tmp_path / "turn.toml"
+    scene.write_text(
+        'duration = 1.0\n[[models]]\nfile = "satellite.xml"\n'
+        '[[keys]]\njoint = "wheel"\ntimes = [0, 1]\nvalues = [0, 2]\n[fit]\nhow = "fit"\nhard = [1.0]\n'
+    )
+    done = CliRunner().invoke(command(), [str(scene), "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "proof to 0.05 rad or m holds: simulated with LQR in the loop" in done.output
+    turned = load(tmp_path / "turn.fit.npz").q[-1, 3:7]
+    assert 2 * np.arctan2(turned[3], turned[0]) == pytest.approx(-2.0 * 0.02 / 0.32, abs=1e-6)
+
+
+def test_a_proof_has_what_the_machine_gives_and_no_more():
+    """A motor that gives nothing beyond half of the fitted speed: cut there, and left behind."""
+    arm = load_model("planar_2r")
+    clip = Clip(arm, {"shoulder": keyed([2.0, 3.0], [-1.0, 0.5]), "elbow": keyed([2.0, 3.0], [0.5, 1.5])})
+    able = machine(arm, force={"shoulder": 150.0, "elbow": 60.0})
+    found = fit(clip, able, hard=[3.0])
+    proof = prove(found, able)
+    assert proof.holds
+    assert proof.worst < 1e-4
+    assert proof.saturated == 0.0
+    assert proof.t[-1] == pytest.approx(1.0)
+    slow = 0.5 * float(np.abs(found.clip.evaluate(found.t).v[:, 0]).max())
+    weak = prove(found, replace(able, top_speed=np.array([slow, np.inf])))
+    assert not weak.holds
+    assert 0.1 < weak.saturated < 1.0
