@@ -57,7 +57,9 @@ def fit(
 ) -> None:
     """Check the keyed motion of a scene against a machine, or make it possible.
 
-    Machine and contacts stand in the scene's table [fit]; options go before it.
+    Machine and contacts stand in the scene's table [fit]; options go before it. The exit status is 1 for a
+    motion that is not possible, and for a fit that strays too far ([fit] within) when it is simulated with
+    the scene's controller, or LQR, in the loop.
     """
     from ..sim.cli import show
     from ..sim.scene.load import load_scene
