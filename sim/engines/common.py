@@ -45,9 +45,12 @@ def steps_per_tick(controls: Controls | None, step: float) -> int:
 
 def fastest_joint(model: mujoco.MjModel, q: Array, v: Array) -> str | None:
     """Name of the fastest joint when the state makes no sense any more, else None."""
-    if np.isfinite(q).all() and (not len(v) or max(v.max(), -v.min()) <= HUGE):  # false for NaN
+    if v.dot(v) <= HUGE and q.dot(q) <= HUGE:  # nearly always, and false for NaN
         return None
-    return joint_of_largest(model, np.where(np.isfinite(v), np.abs(v), np.inf))
+    speed = np.where(np.isfinite(v), np.abs(v), np.inf)
+    if np.isfinite(q).all() and np.all(speed <= HUGE):
+        return None
+    return joint_of_largest(model, speed)
 
 
 def joint_of_largest(model: mujoco.MjModel, speed: Array) -> str:
