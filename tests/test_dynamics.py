@@ -17,7 +17,7 @@ from pantograph.sim.dynamics.layout import Layout, keyed_joints
 from pantograph.sim.dynamics.motion.prescribed import pieces_of
 from pantograph.sim.dynamics.symbolic import Equations
 from pantograph.sim.errors import EngineError
-from pantograph.sim.integrate import TABLEAUS, solve
+from pantograph.sim.integrate import ODE, TABLEAUS, Event, Status, solve
 from strategies import random_states, seeds, trees
 
 MJCF = Path(__file__).parent.parent / "models" / "mjcf"
@@ -851,6 +851,114 @@ def test_methods_have_names():
         np.testing.assert_array_equal(run("bosh3"), run(TABLEAUS["bosh3"]))
         with pytest.raises(EngineError, match=r"did you mean 'dopri5'.*verner98"):
             run("dopri")
+
+
+# ---- the front door
+
+
+def step_by_step(problem):
+    """The same equations without compiled loops."""
+    return ODE(problem.f, problem.ndim, problem.project)
+
+
+@pytest.fixture(scope="module")
+def posed():
+    """A problem and a start of either kind of joints."""
+    top, swing = (compile_model(of_text(xml), cache=None) for xml in (TOP, SWING))
+    q, v = (x[0] for x in states_of(of_text(TOP), 7, 1)[:2])
+    return {
+        "quaternions": (top.problem(), np.concatenate([3.0 * q, 2 * v])),  # put on the sphere first
+        "hinges": (swing.problem([0.3, -0.2]), np.array([0.5, 0.3, 1.0, -0.5])),
+    }
+
+
+@pytest.mark.parametrize("kind", ["quaternions", "hinges"])
+@pytest.mark.parametrize("method", [*TABLEAUS])
+def test_the_front_door_hands_fixed_steps_to_compiled_loops_that_agree(posed, kind, method):
+    problem, y0 = posed[kind]
+    # step by step, a method that is FSAL begins with its last slope, of quaternions before they are put back
+    rounding = 1e-9 if TABLEAUS[method].fsal and kind == "quaternions" else 1e-13
+    t0 = 0.7
+    grid = t0 + 0.01 * np.arange(21)
+    for span, times in (
+        ((t0, t0 + 0.2), None),
+        ((t0, t0 + 0.203), None),  # the last step is cut
+        ((t0, t0 + 0.004), None),
+        ((t0, t0 + 0.203), grid[[0, 3, 3, 20]]),
+        ((t0, t0 + 0.203), [t0 + 0.001, t0 + 0.004, t0 + 0.05, t0 + 0.2015, t0 + 0.203]),
+        ((t0, t0 + 0.2), np.linspace(t0, t0 + 0.2, 41)),
+    ):
+        given = {"method": method, "step": 0.01, "t_eval": times, "error": True}
+        ours, slow = solve(problem, span, y0, **given), solve(step_by_step(problem), span, y0, **given)
+        np.testing.assert_array_equal(ours.t, slow.t)
+        np.testing.assert_allclose(ours.y, slow.y, rtol=0, atol=rounding)
+        np.testing.assert_allclose(ours.error, slow.error, rtol=0, atol=rounding)
+        assert (ours.status, ours.message, ours.stats.steps) == (slow.status, slow.message, slow.stats.steps)
+        most = 1.5 if times is None else 3.0  # a step around a time is done again
+        assert 0 < ours.stats.evaluations <= most * slow.stats.evaluations + 10
+
+
+@pytest.mark.parametrize("kind", ["quaternions", "hinges"])
+def test_the_front_door_hands_tolerances_to_compiled_loops(posed, kind):
+    problem, y0 = posed[kind]
+    times, span = [0.0, 0.1, 0.1, 0.25, 0.37], (0.0, 0.5)
+    exact = solve(step_by_step(problem), span, y0, method="dop853", rtol=1e-13, t_eval=times).y
+    called, f = [], problem.f
+    problem.f = lambda t, y: called.append(t) or f(t, y)
+    for tolerance in (1e-5, 1e-8):
+        given = {"method": "dopri5", "rtol": tolerance, "t_eval": times}
+        ours, slow = (
+            solve(problem, span, y0, **given),
+            solve(ODE(f, len(y0), problem.project), span, y0, **given),
+        )
+        np.testing.assert_array_equal(ours.t, times)
+        assert np.abs(ours.y - exact).max() < 5 * np.abs(slow.y - exact).max()
+        assert ours.stats.evaluations == pytest.approx(slow.stats.evaluations, rel=0.1)
+        assert ours.stats.steps == pytest.approx(slow.stats.steps, rel=0.1)
+        assert (ours.status, ours.message) == (slow.status, slow.message)
+    del problem.f
+    assert len(called) == 4  # to choose the first steps
+
+
+def test_what_compiled_loops_cannot_do_goes_step_by_step(posed):
+    problem, y0 = posed["hinges"]
+    given = {"method": "dopri5", "rtol": 1e-8}
+    turned = Event(lambda t, y: y[0] - 0.6, name="turned")
+    for special in ({"events": [turned]}, {"dense": True}, {"t_eval": None}):
+        ours = solve(problem, (0.0, 0.5), y0, **given | special)
+        slow = solve(step_by_step(problem), (0.0, 0.5), y0, **given | special)
+        np.testing.assert_array_equal(ours.y, slow.y)
+        assert [o.t for o in ours.events] == [o.t for o in slow.events]
+    back = solve(problem, (0.5, 0.0), ours.y[-1], t_eval=[0.0], rtol=1e-10)
+    np.testing.assert_allclose(back.y[0], y0, rtol=0, atol=1e-6)
+    pushed = problem_of_a_push()
+    ours = solve(pushed, (0.0, 0.5), y0, step=0.01)
+    np.testing.assert_array_equal(ours.y, solve(step_by_step(pushed), (0.0, 0.5), y0, step=0.01).y)
+
+
+def problem_of_a_push():
+    return compile_model(of_text(SWING), cache=None).problem(lambda t, q, v: [np.sin(20 * t), -v[0]])
+
+
+def test_failures_of_compiled_loops_are_told_at_the_front_door(posed):
+    problem, y0 = posed["hinges"]
+    times = np.linspace(0.0, 2.0, 21)
+    for how in ({"step": 0.01}, {"rtol": 1e-9}):
+        ours = solve(problem, (0.0, 2.0), y0, t_eval=times, max_steps=30, **how)
+        slow = solve(step_by_step(problem), (0.0, 2.0), y0, t_eval=times, max_steps=30, **how)
+        assert ours.status == slow.status == Status.TOO_MANY_STEPS
+        assert ours.stats.steps == slow.stats.steps == 30
+        assert 0 < len(ours.t) < 21 and np.isfinite(ours.y).all()
+        assert "30 steps reached only t = 0." in ours.message
+    np.testing.assert_array_equal(
+        solve(problem, (0.0, 2.0), y0, t_eval=times, max_steps=30, step=0.01).t, times[:4]
+    )
+    wild = np.array([0.5, 0.3, 1e200, -1e200])
+    for how in ({"step": 0.01}, {"rtol": 1e-6}):
+        ours = solve(problem, (0.0, 2.0), wild, t_eval=times, **how)
+        assert ours.status == solve(step_by_step(problem), (0.0, 2.0), wild, t_eval=times, **how).status
+        assert ours.status == Status.DIVERGED and "not finite" in ours.message
+        np.testing.assert_array_equal(ours.t, [0.0])
 
 
 # ---- what it cannot do, what it does otherwise, what it keeps

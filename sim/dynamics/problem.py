@@ -9,11 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import EngineError
+from ..integrate.handed import Followed
+from ..integrate.solution import Status
+from ..integrate.tableau import Tableau
 
 if TYPE_CHECKING:
     from .smooth import Smooth
 
 Array = NDArray[np.float64]
+
+_STATUS = (Status.FINISHED, Status.TOO_MANY_STEPS, Status.STEP_TOO_SMALL, Status.DIVERGED)
+"""Of `motion.path.STATUS`."""
 
 
 class SmoothProblem:
@@ -28,7 +34,7 @@ class SmoothProblem:
             raise EngineError(
                 "keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints"
             )
-        self.ndim, self._layout = lay.nx, lay
+        self.ndim, self._layout, self._smooth = lay.nx, lay, smooth
         self._bound = smooth.bind("rate")
         self._inputs = self._bound.inputs
         self._inputs["p"][:] = smooth.parameter_values
@@ -54,6 +60,41 @@ class SmoothProblem:
             inputs["w"][:] = np.asarray(self._w(np.array([t])))[0]
         self._bound()
         return self._bound.outputs["dx"].copy()
+
+    def march(
+        self, method: Tableau, t: float, y: Array, step: float, steps: int, /
+    ) -> tuple[Array, int] | None:
+        """See `sim.integrate.handed.CompiledProblem`."""
+        if self._controls is not None:
+            return None
+        q, v, act = self._parts(y)
+        path = self._smooth.rollout(
+            q, v, self._inputs["u"].copy(), step=step, steps=steps, method=method, act0=act, w=self._motion(),
+            t0=t,
+        )  # fmt: skip
+        return path.x, int(path.evaluations)
+
+    def follow(
+        self, method: Tableau, times: Array, y: Array, rtol: float, atol: Array, h: float, most: int, /
+    ) -> Followed | None:
+        """See `sim.integrate.handed.CompiledProblem`; prescribed motion that moves is not for it."""
+        if self._controls is not None or self._w is not None:
+            return None
+        q, v, act = self._parts(y)
+        path = self._smooth.integrate(
+            q, v, times, self._inputs["u"].copy(), method=method, rtol=rtol, atol=atol, act0=act,
+            w=self._motion(), first_step=h, max_steps=most,
+        )  # fmt: skip
+        numbers = (int(x) for x in (path.evaluations, path.steps, path.rejected))
+        return Followed(path.x, float(path.reached), _STATUS[path.status], *numbers)
+
+    def _parts(self, y: Array) -> tuple[Array, Array, Array]:
+        lay = self._layout
+        return y[: lay.nq], y[lay.nq : lay.nq + lay.nv], y[lay.nq + lay.nv :]
+
+    def _motion(self) -> Any:
+        """The prescribed motion as integrations take it."""
+        return self._w if self._w is not None else self._inputs["w"].copy() if self._layout.nw else None
 
     def project(self, y: Array, /) -> Array:
         """The state with all quaternions normalised."""

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _KINDS = "qqqPPddPdPPPqqPqPPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
-_NEXT = STATISTICS.index("next_step")
+_NEXT, _TIME = STATISTICS.index("next_step"), STATISTICS.index("time")
 _ONE_SPAN = np.array([[0, 0, 0, -1]])
 JUMP = 1e-9
 """A prescribed velocity that changes by less than this part of itself does not jump."""
@@ -210,12 +210,15 @@ def _compiled(
     in_parallel(call, count, lanes, smooth.threads if count > lanes else 1)
     seconds = time.perf_counter() - begin
     shown = applied if law is not None else rows.shown(count)
-    _, rejected, evaluations, status = stats.astype(np.int64).T[:4]
+    taken, rejected, evaluations, status = stats.astype(np.int64).T[:4]
     if goes_on:
         h[:] = stats[:, _NEXT]
     times = t_eval.view()
     times.flags.writeable = False
-    return finish(smooth, start, times, path, shown, evaluations, seconds, rejected=rejected, status=status)
+    return finish(
+        smooth, start, times, path, shown, evaluations, seconds,
+        steps=taken, reached=stats[:, _TIME], rejected=rejected, status=status,
+    )  # fmt: skip
 
 
 def _called_back(
@@ -235,8 +238,8 @@ def _called_back(
     lay, x, count = smooth.layout, start.x, len(start.x)
     ends = np.append(t_eval[0] + hold * np.arange(periods), t_eval[-1])
     path, applied = np.full((count, len(t_eval), lay.nx), np.nan), np.full((count, periods, lay.nu), np.nan)
-    status, evaluations, rejected = np.zeros((3, count), np.int64)
-    seconds = 0.0
+    status, evaluations, rejected, taken = np.zeros((4, count), np.int64)
+    seconds, reached = 0.0, np.full(count, t_eval[0])
     for k, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         q, v = x[:, : lay.nq], x[:, lay.nq : lay.nq + lay.nv]
         applied[:, k] = controls(begin, q[0], v[0]) if start.single else controls(begin, q, v)
@@ -247,6 +250,7 @@ def _called_back(
         )
         path[:, inside] = part.x[:, np.isin(times, t_eval[inside])]
         evaluations, rejected = evaluations + part.evaluations, rejected + part.rejected
+        taken, reached = taken + part.steps, np.where(status == 0, part.reached, reached)
         status = np.where(status == 0, part.status, status)
         seconds += part.seconds
         x = np.ascontiguousarray(part.x[:, -1])
@@ -254,7 +258,10 @@ def _called_back(
             break
     shown = t_eval.view()
     shown.flags.writeable = False
-    return finish(smooth, start, shown, path, applied, evaluations, seconds, rejected=rejected, status=status)
+    return finish(
+        smooth, start, shown, path, applied, evaluations, seconds,
+        steps=taken, reached=reached, rejected=rejected, status=status,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

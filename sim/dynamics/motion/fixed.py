@@ -90,7 +90,7 @@ def fixed(
     seconds = time.perf_counter() - begin
     shown = applied if law is not None else rows.shown(count)
     t = _record_times(t0, step * every, path.shape[1])
-    return finish(smooth, start, t, path, shown, np.array([evaluations]), seconds)
+    return finish(smooth, start, t, path, shown, np.array([evaluations]), seconds, steps=np.array([steps]))
 
 
 def stage_times(method: Tableau, t0: float, step: float, steps: int) -> Array:
@@ -141,4 +141,7 @@ def _called_back(
     path = np.concatenate(pieces, axis=1)
     stages = fixed_loop(smooth, 1 if len(x) == 1 else smooth.lanes, None, rest["method"]).stages
     t = _record_times(t0, step * every, path.shape[1])
-    return finish(smooth, start, t, path, np.stack(applied, axis=1), np.array([steps * stages]), seconds)
+    return finish(
+        smooth, start, t, path, np.stack(applied, axis=1), np.array([steps * stages]), seconds,
+        steps=np.array([steps]),
+    )  # fmt: skip

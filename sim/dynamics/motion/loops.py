@@ -135,22 +135,32 @@ def finish(
     evaluations: NDArray[np.int64],
     seconds: float,
     *,
+    steps: NDArray[np.int64],
+    reached: Array | None = None,
     rejected: NDArray[np.int64] | None = None,
     status: NDArray[np.int64] | None = None,
 ) -> Path:
-    """The result as it was asked for: a batch or one state."""
+    """The result as it was asked for: a batch or one state; fixed steps reached their last finite record."""
     rejected, status = _NONE if rejected is None else rejected, _NONE if status is None else status
+    came = t[-1:] if reached is None else reached
     # one number is infinite or none if any is, or if the sum of very large ones is
     total = path[0, -1].dot(smooth.ones) if len(path) == 1 else np.add.reduce(path[:, -1], None)
     if not math.isfinite(total):
         finite = np.isfinite(path[:, -1]).all(axis=1)
         lost = ~finite & ((status == 0) | ~np.isfinite(path[:, 0]).all(axis=1))
         status = np.where(lost, STATUS.index("not finite"), status)
+        if reached is None:
+            came = t[np.maximum(np.isfinite(path).all(axis=2).sum(axis=1) - 1, 0)]
     path.setflags(write=False)
     u.setflags(write=False)
     nq, nv = smooth.layout.nq, smooth.layout.nv
     if start.single:
-        return Path(t, path[0], u[0], status[0], evaluations[0], rejected[0], seconds, nq, nv)
-    count = len(path)
-    evaluations, rejected = np.broadcast_to(evaluations, count), np.broadcast_to(rejected, count)
-    return Path(t, path, u, np.broadcast_to(status, count), evaluations, rejected, seconds, nq, nv)
+        return Path(
+            t, path[0], u[0], status[0], evaluations[0], rejected[0], steps[0], came[0], seconds, nq, nv
+        )
+    n = len(path)
+    status, evaluations, rejected, steps = (
+        np.broadcast_to(x, n) for x in (status, evaluations, rejected, steps)
+    )
+    came = np.broadcast_to(came, n)
+    return Path(t, path, u, status, evaluations, rejected, steps, came, seconds, nq, nv)

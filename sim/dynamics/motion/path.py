@@ -23,6 +23,8 @@ class Path:
         status: how each motion ended, an index of STATUS; 0 is success. After a failure records are NaN.
         evaluations: of dx/dt, for each state.
         rejected: steps done again, for each state (fixed steps: none).
+        steps: steps that were kept, for each state.
+        reached: time to which each state came [s].
         seconds: wall time of the integration itself.
     """
 
@@ -32,6 +34,8 @@ class Path:
     status: NDArray[np.int64]
     evaluations: NDArray[np.int64]
     rejected: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    reached: Array
     seconds: float
     nq: int
     nv: int
