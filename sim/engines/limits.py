@@ -103,8 +103,7 @@ class Limits:
 
     def _far(self, q: Array, v: Array, step: float) -> bool:
         """Whether no limit can be suspect: all are farther than any joint comes in a step and back."""
-        flat = v.ravel()
-        return bool(self.gaps(q).min() > 2.0 * step * np.sqrt(flat.dot(flat)))
+        return bool(self.gaps(q).min() > 2.0 * step * max(v.max(), -v.min()))
 
     def near(
         self, q0: Array, v0: Array, q1: Array, v1: Array, step: float, resting: tuple[Limit, ...]
