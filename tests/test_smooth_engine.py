@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 
 import mujoco
 import numpy as np
@@ -265,6 +266,28 @@ def test_dry_friction_stops_a_sliding_joint_where_coulomb_says(tmp_path):
     assert abs(r.q[-1, 0] - 0.75) < 0.02
     assert abs(r.v[-1, 0]) < 1e-3
     np.testing.assert_allclose(r.q[r.t < 0.9, 0], (1.5 * r.t - 0.75 * r.t**2)[r.t < 0.9], atol=2e-3)
+
+
+HELD = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" frictionloss="{friction}"/>
+<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" contype="0" conaffinity="0"/>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_what_dry_friction_holds_creeps_as_told_and_hardly_by_tolerance(tmp_path, share):
+    model = mujoco.MjModel.from_xml_string(HELD.format(friction=0))
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.9
+    mujoco.mj_forward(model, data)
+    xml = HELD.format(friction=float(data.qfrc_bias[0]) / share)
+    for solver, most in (({}, 0.5), ({"tolerance": 1e-5}, 5e-3), ({"tolerance": 1e-9}, 5e-3)):
+        scene = scene_of(tmp_path, xml, duration=1.0, initial={"position": {"a": 0.9}}, solver=solver)
+        plan = make_plan(scene)
+        (line,) = (line for line in plan.left_out if "creeps" in line)
+        width = float(re.search(r"below (\S+) rad/s", line)[1])
+        slope = (run(plan).q[-1, 0] - 0.9) / 1.0
+        assert -slope == pytest.approx(width * share / np.sqrt(1 - share**2), rel=0.2)
+        assert -slope < most
 
 
 def test_adaptive_error_follows_the_tolerance():

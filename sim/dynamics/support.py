@@ -182,6 +182,10 @@ def differences(
     dry = [d for d in np.flatnonzero(model.dof_frictionloss) if int(model.dof_jntid[d]) not in keyed]
     if dry and not (disabled(model, "FRICTIONLOSS") or disabled(model, "CONSTRAINT")):
         on = "one freedom" if len(dry) == 1 else f"{len(dry)} freedoms"
-        how = "left out" if friction_width is None else f"smoothed below {friction_width:g} rad/s or m/s"
+        how = "left out"
+        if friction_width is not None:
+            # F v / sqrt(v^2 + w^2) = load gives v = w r / sqrt(1 - r^2), r = load / F
+            how = f"smoothed below {friction_width:.3g} rad/s or m/s, and what it holds creeps at about that "
+            how += "times load over friction, or faster near its limit"
         found.append(f"dry friction on {on} is {how}; MuJoCo models it as a soft constraint")
     return found

@@ -11,6 +11,10 @@ from .interface import Controls, Problem, Role, Segment
 from .limits import in_words
 from .stiffness import friction_width
 
+NARROWED = 2e-5, 1e-3
+"""Step [s] and least width [rad/s, m/s] by which friction is smoothed in runs to a tolerance: so small a step
+is needed only where something sticks, and compiled code makes it in a microsecond or few."""
+
 
 def methods() -> dict[str, int]:
     """Names of the methods, and their orders."""
@@ -42,7 +46,8 @@ def width_of(problem: Problem) -> float | None:
     """The `friction_width` of a problem: what it was planned with, whatever its step is now."""
     if problem.friction_width is not None:
         return problem.friction_width
-    return friction_width(problem.model, problem.state0.q, ~problem.dofs(Role.KEYED), problem.step)
+    step, least = (problem.step, 0.01) if problem.tolerance is None else NARROWED
+    return friction_width(problem.model, problem.state0.q, ~problem.dofs(Role.KEYED), step, least)
 
 
 class SmoothEngine:

@@ -43,10 +43,12 @@ def _holding(model: mujoco.MjModel, held: NDArray[np.bool_]) -> mujoco.MjModel:
     return m
 
 
-def friction_width(model: mujoco.MjModel, q: Array, moving: NDArray[np.bool_], step: float) -> float | None:
+def friction_width(
+    model: mujoco.MjModel, q: Array, moving: NDArray[np.bool_], step: float, least: float = 0.01
+) -> float | None:
     """Speed [rad/s, m/s] below which dry friction is smoothed; None without friction.
 
-    At least 0.01, and wide enough that the smoothed force is not stiff for the step: the largest rate
+    At least `least`, and wide enough that the smoothed force is not stiff for the step: the largest rate
     eig(M^-1 diag(friction)) / width stays below 1/step.
     """
     off = int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -55,7 +57,7 @@ def friction_width(model: mujoco.MjModel, q: Array, moving: NDArray[np.bool_], s
         return None
     root = np.sqrt(model.dof_frictionloss[dry])
     fastest = np.linalg.eigvalsh(root[:, None] * mobility(model, q, dry, ~moving) * root)[-1]
-    return max(0.01, float(fastest) * step)
+    return max(least, float(fastest) * step)
 
 
 def fastest_rate(model: mujoco.MjModel, looks: Iterable[Look], moving: NDArray[np.bool_]) -> float:
