@@ -382,3 +382,41 @@ def test_a_model_without_joints_and_the_world_itself_are_judged():
         verdict = solve(model, goals).verdict
         assert (verdict.kind, verdict.proved) == ("out of reach", True)
         assert verdict.position == pytest.approx(0.5)
+
+
+# Limits.
+
+
+def test_only_goals_that_limits_exclude_are_named():
+    model = ik_cases.planar_chain([0.5, 0.5, 0.5], [(-1, 1)] * 3)
+    beyond, fine = JointValue("j0", 1.5, name="beyond"), JointValue("j1", 0.5, name="fine")
+    assert solve(model, [beyond, fine]).verdict.goals == ("beyond",)
+    assert solve(model, [fine, beyond]).verdict.goals == ("beyond",)
+    both = solve(model, [beyond, fine, JointValue("j2", -1.7, name="too")]).verdict
+    assert both.goals == ("beyond", "too") and set(both.joints) == {"j0", "j2"}
+    two = ik_cases.planar_chain([1.0, 0.8], [(-3, 3), (0.1, 3)])  # together alone: the elbow bends one way
+    down = max(ik_planar.two_links((1.0, 0.8), [1.2, 0.7]), key=lambda q: q[0])
+    place, aside = Position("tip", [1.2, 0.7, 0], name="p"), Orientation("tip", ik_cases.quat_z(down.sum()))
+    verdict = solve(two, [place, aside]).verdict
+    assert verdict.kind == "held by limits" and len(verdict.goals) == 2
+
+
+@pytest.mark.parametrize("seed", [95, 136, 0, 1, 2, 3])  # the first two have nearer corners than searches met
+def test_how_far_within_limits_is_the_least_there_is(seed):
+    """Against all poses that could be nearest."""
+    case = ik_cases.limited_point(np.random.default_rng([seed, 77]))
+    verdict = solve(case.model, case.goals).verdict
+    assert (verdict.kind, verdict.proved) == ("held by limits", True)
+    assert verdict.position == pytest.approx(case.distance, abs=1e-9)
+    assert f"{verdict.position:.6g} m remain" in verdict.reason
+
+
+def test_a_distance_is_told_as_exact_where_a_bound_from_below_agrees():
+    arm = ik_cases.planar_chain([1.0, 0.8])
+    reason = solve(arm, Position("tip", [2.3, 0, 0])).verdict.reason
+    assert "0.5 m remain" in reason and "at most" not in reason
+    arm = ik_cases.planar_chain([1.0, 0.8], [(-1, 1)] * 2)
+    verdict = solve(arm, Position("tip", [0, -1, 0])).verdict  # proved not to be met, not how far
+    assert verdict.proved and f"at most {verdict.position:.6g} m remain" in verdict.reason
+    reason = solve(arm, JointValue("j0", 1.5)).verdict.reason
+    assert "0.5 rad remain" in reason and "at most" not in reason

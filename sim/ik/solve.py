@@ -78,6 +78,7 @@ def solve(
     complete = all and len(found) > 0 and _listed(judged, form, found)
     if len(found) and not complete and (all or not near or not search.direct):  # the best may lie elsewhere
         found = np.concatenate([found, search.more(restarts if all else 40)])
+    found = found if len(found) else search.spread()
     if not len(found):
         nearest = brought(search)
         reason = diagnose(judged, search, nearest)

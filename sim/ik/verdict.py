@@ -27,8 +27,10 @@ class Verdict:
 
     Attributes:
         kind: what was found.
-        proved: a bound, a closed form or a subdivision says so; otherwise only that searches from `restarts`
-            random starts found nothing else. An answer that meets its goals is its own proof.
+        proved: a bound, a closed form or a subdivision says that the goals cannot be met; otherwise only
+            that searches from `restarts` random starts found nothing else. It says nothing of how far, which
+            is that of the nearest pose found: `reason` puts "at most" where no bound from below agrees. An
+            answer that meets its goals is its own proof.
         reason: in words.
         position, rotation: how far out of reach [m], [rad]; each with the other held where a pose's two parts
             can be met only apart. Limits of joints count unless limits alone are the reason (then 0).

@@ -376,6 +376,22 @@ def limited_value(rng):
     return Case("joint value", model, goals, "held by limits", joints=(frozenset([f"j{j}"]),))
 
 
+def limited_point(rng):
+    """A planar arm of two to four narrow joints and a point in its ring, farther from its area than 0.1 m."""
+    lengths = rng.uniform(0.3, 1.2, int(rng.integers(2, 5)))
+    ranges = [(low, low + rng.uniform(0.2, 2.2)) for low in rng.uniform(-2.5, 0.3, len(lengths))]
+    tip = planar.forward(lengths, rng.uniform(-np.pi, np.pi, len(lengths)))[-1]
+    grid = np.meshgrid(*(np.linspace(*r, 13) for r in ranges))
+    angles = np.cumsum(np.stack([x.ravel() for x in grid], axis=1), axis=1)
+    seen = np.abs(np.exp(1j * angles) @ lengths - complex(*tip)).min()
+    if seen < 0.3:
+        return limited_point(rng)
+    distance = planar.nearest_within(lengths, ranges, tip)
+    assert 0.1 < distance <= seen + 1e-12
+    goal = Position("tip", [*tip, 0])
+    return Case("point within limits", planar_chain(lengths, ranges), [goal], "held by limits", distance)
+
+
 def limited_direction(rng):
     """One hinge turned beyond its range to point the tip."""
     half = rng.uniform(0.2, 1.5)
@@ -489,6 +505,7 @@ LIMITED = (
     limited_two_links,
     limited_three_links,
     limited_elbow,
+    limited_point,
     limited_value,
     limited_direction,
     beyond_slides,

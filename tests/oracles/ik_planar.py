@@ -1,5 +1,7 @@
 """Planar arms in closed form, by trigonometry: all solutions, and how far a target is out of reach."""
 
+from itertools import product
+
 import numpy as np
 
 
@@ -35,6 +37,37 @@ def gap(lengths, distance):
     longest = max(lengths)
     inner = max(0.0, 2 * longest - sum(lengths))
     return max(0.0, distance - sum(lengths), inner - distance)
+
+
+def nearest_within(lengths, ranges, target):
+    """Least distance of the tip from a point that cannot be met within ranges (n, 2).
+
+    At the nearest pose every joint is at an end of its range, or its anchor lies on the line through tip and
+    target; all such poses are tried.
+    """
+    n, p, best = len(lengths), complex(*target), np.inf
+    for ends in product((0, 1, None), repeat=n):  # None: free
+        for signs in product((1, -1), repeat=ends.count(None)):
+            q, v, turn = np.zeros(n), 0j, iter(signs)
+            for k in range(
+                n - 1, -1, -1
+            ):  # v: from the anchor of joint k to the tip, in the frame of its link
+                v = lengths[k] + v
+                if ends[k] is not None:
+                    q[k] = ranges[k][ends[k]]
+                elif (first := ends.index(None)) == k:
+                    base = forward(lengths[:k], [ranges[j][ends[j]] for j in range(k)])[-1] if k else (0, 0)
+                    before = sum(ranges[j][ends[j]] for j in range(k))
+                    q[k] = wrap(np.angle(next(turn) * (p - complex(*base))) - before - np.angle(v))
+                else:
+                    j = max(i for i in range(first, k) if ends[i] is None)
+                    held = [0.0, *(ranges[i][ends[i]] for i in range(j + 1, k))]
+                    link = complex(*forward(lengths[j:k], held)[-1])  # between both anchors
+                    q[k] = wrap(np.angle(next(turn) * link) - sum(held) - np.angle(v))
+                v = v * np.exp(1j * q[k])
+            if all(low - 1e-12 <= x <= high + 1e-12 for x, (low, high) in zip(q, ranges, strict=True)):
+                best = min(best, abs(complex(*forward(lengths, q)[-1]) - p))
+    return best
 
 
 def wrap(angle):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from .descend import LONGEST, Descent, descend
 Array = NDArray[np.float64]
 AT_LIMIT = 1e-6  # [rad or m] beyond a limit: clipped, it may still be right
 _FAR = 10.0  # [lengths of the problem] that bounded steps may not come
+_FEW = 4  # joints whose ranges are looked at end by end
 _BLOCKS = (6, 24, 64)  # starts side by side, growing while nothing is found
 
 
@@ -105,6 +107,19 @@ class Search:
         n = max(0, min(n, self.restarts - self.used))
         middle = self.problem.space.middle(self.start, self.problem.moved)
         return self._attempt(np.concatenate([self.start[None], middle[None], self._random(n)]))
+
+    def spread(self) -> Array:
+        """Solutions (k, nq) from ends and middles of few joints' ranges, where nearest poses often are."""
+        space, moved = self.problem.space, self.problem.moved
+        columns = np.flatnonzero(moved & np.isfinite(space.low) & np.isfinite(space.high))
+        scalar = columns[np.isin(columns, space.scalar_v)]
+        if not 0 < len(scalar) <= _FEW:
+            return np.zeros((0, space.nq))
+        low, high = space.low[scalar], space.high[scalar]
+        levels = [(low[k], 0.5 * (low[k] + high[k]), high[k]) for k in range(len(scalar))]
+        q = np.tile(self.start, (3 ** len(scalar), 1))
+        q[:, space.q_of_v[scalar]] = list(product(*levels))
+        return self._attempt(q)
 
     def _random(self, n: int) -> Array:
         self.used += n

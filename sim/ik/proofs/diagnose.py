@@ -19,6 +19,7 @@ from ..wholes import CenterOfMass
 from .gaps import NO_GAP, Gap, closed_form_outside, goal_gap, pair_gap, pairs, rooms, subdivision
 
 Array = NDArray[np.float64]
+_SAME = 1e-6  # [m, rad] between two bounds of a distance that is known
 
 
 class Diagnosis(NamedTuple):
@@ -133,11 +134,25 @@ def _held(problem: Problem, search: Search, nearest: Descent, free: Array) -> Di
         joints[name] = max(joints[name], float(excess[v]))
     proved = _proved_held(problem, search)
     position, rotation = _sizes(problem, nearest.r)
+    held = _held_goals(problem, search)
+    gaps = [goal_gap(problem, goal, search.start) for goal in problem.goals]
+    gap = Gap(float(np.hypot.reduce([g.position for g in gaps])),
+              float(np.hypot.reduce([g.rotation for g in gaps])), "")  # fmt: skip
     names = " and ".join(f"{name} (by {far:.4g})" for name, far in joints.items())
-    reason = f"without limits they are met, with {names} outside; inside, {_words(position, rotation)} remain"
-    goals = tuple(g.label for g in problem.goals)
-    verdict = Verdict("held by limits", proved, reason, position, rotation, 0.0, joints, goals)
+    left = _remaining(position, rotation, gap)
+    reason = f"without limits they are met, with {names} outside; inside, {left} remain"
+    verdict = Verdict(
+        "held by limits", proved, reason, position, rotation, 0.0, joints, tuple(g.label for g in held)
+    )
     return _negative(problem, verdict, free)
+
+
+def _held_goals(problem: Problem, search: Search) -> tuple[Goal, ...]:
+    """Goals that limits exclude alone, or a smallest set that they exclude together."""
+    goals = problem.goals
+    if len(goals) == 1:
+        return goals
+    return tuple(g for g in goals if not _meets(problem.only([g]), search)) or _core(problem, search)
 
 
 def _proved_held(problem: Problem, search: Search) -> bool:
@@ -164,6 +179,12 @@ def _words(position: float, rotation: float) -> str:
     return " and ".join(parts) or "nothing"
 
 
+def _remaining(position: float, rotation: float, gap: Gap) -> str:
+    """How far in words: a nearest pose that was found bounds it from above, a proved gap from below."""
+    sure = position - gap.position < _SAME and rotation - gap.rotation < _SAME
+    return ("" if sure else "at most ") + _words(position, rotation)
+
+
 def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal, gap: Gap) -> Diagnosis:
     """One goal that cannot be met even without limits."""
     alone = problem.only([goal])
@@ -177,11 +198,11 @@ def _out_of_reach(problem: Problem, search: Search, nearest: Descent, goal: Goal
     if not proved and subdivision(alone, search.start):
         proved, by = True, "subdivision of its joints' ranges"
     sure = search.agreed() >= 2 or proved
-    reason = f"{goal.label} cannot come nearer than {_words(position, rotation)}"
+    reason = f"{goal.label} cannot be met; {_remaining(position, rotation, gap)} remain"
     if isinstance(goal, Pose) and position > 1e-9 and rotation > 1e-9 and not gap.position:
         reason = (
-            f"{goal.label}: position and orientation are met only apart: {position:.6g} m remain when turned "
-            f"right, {rotation:.6g} rad when placed right"
+            f"{goal.label}: position and orientation are met only apart: at most {position:.6g} m remain "
+            f"when turned right, {rotation:.6g} rad when placed right"
         )
     if proved:
         reason += f", by {by}"
@@ -286,15 +307,22 @@ def _together(problem: Problem, search: Search, nearest: Descent) -> Diagnosis:
             search.iterations += part.iterations
             if not len(inner.found):
                 return inner
+    return _conflict(problem, search, nearest, _core(problem, search), NO_GAP)
+
+
+def _core(problem: Problem, search: Search) -> tuple[Goal, ...]:
+    """Deletion filter over goals that can be met alone: what is left cannot spare any goal."""
     core = list(problem.goals)
-    for goal in problem.goals:  # deletion filter: what is left cannot spare any goal
+    for goal in problem.goals:
         rest = [g for g in core if g is not goal]
         if len(rest) > 1 and not _meets(problem.only(rest), search):
             core = rest
-    return _conflict(problem, search, nearest, tuple(core), NO_GAP)
+    return tuple(core)
 
 
 def _meets(problem: Problem, search: Search) -> bool:
+    if excluded(problem, search.start):
+        return False
     part = search.part(problem, min(search.restarts, 100), 5)
     met = len(part.solutions(search.best.q[:6])) > 0
     search.iterations += part.iterations
