@@ -373,6 +373,61 @@ def test_a_whole_motion_beyond_reach_stays_stretched():
     np.testing.assert_allclose(motion.q, 0, atol=1e-6)
 
 
+def _over_a_floor():
+    """Three links in a vertical plane, a floor, and a thin wall within reach."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    world, plane, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
+    world.add_geom(name="floor", type=plane, size=[2, 2, 0.1])
+    world.add_geom(name="wall", type=box, size=[0.02, 1, 3], pos=[0.6, 0, 0])
+    body = world
+    for i, (away, length) in enumerate(((0.6, 0.5), (0.5, 0.4), (0.4, 0.1))):
+        body = body.add_body(pos=[0, 0, away] if i == 0 else [away, 0, 0])
+        body.add_joint(name=f"j{i}", type=ik_cases.HINGE, axis=[0, 1, 0], limited=True, range=[-3, 3])
+        body.add_geom(
+            name=f"g{i}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[0, 0, 0, length, 0, 0],
+            size=[0.03, 0, 0],
+        )
+    body.add_site(name="tip", pos=[0.1, 0, 0])
+    return spec.compile()
+
+
+@pytest.mark.parametrize("limits", [{}, {"velocity": 2.0}, {"velocity": 2.0, "acceleration": 20.0}])
+@pytest.mark.parametrize("start", [(0.3, -0.2, 0.0), (-0.9, 0.4, 0.3), (0.5, 0.1, 0.2)])
+@pytest.mark.parametrize("geoms", [(2,), (0, 1, 2)])
+def test_a_hand_goes_down_to_the_floor_from_anywhere_and_no_further(start, geoms, limits):
+    """The goal is 0.1 m below the floor: the nearest is the clearance above it, whatever way is left."""
+    model, clearance = _over_a_floor(), 0.02
+    pairs = [(f"g{i}", "floor") for i in geoms]
+    follower = Follower(model, dt=0.01, q0=start, apart=pairs, clearance=clearance, **limits)
+    data, nearest = mujoco.MjData(model), np.inf
+    for _ in range(300):
+        tick = follower.step([Position("tip", [0.5, 0, -0.1])])
+        data.qpos[:] = tick.q
+        mujoco.mj_kinematics(model, data)
+        for i in geoms:
+            ends = np.zeros(6)
+            found = mujoco.mj_geomDistance(model, data, model.geom(f"g{i}").id, 0, 1.0, ends)
+            nearest = min(nearest, found)
+    assert nearest >= (0.25 if "acceleration" in limits else 1.0) * clearance - 1e-4
+    assert data.site("tip").xpos[2] == pytest.approx(0.03 + clearance, abs=1e-3)
+    assert any("near floor" in what for what in tick.held)
+
+
+@pytest.mark.parametrize("start", [(1.5, 0.5, 0.0), (-1.8, -0.5, 0.2), (1.3, 1.2, 0.5)])
+def test_without_limits_of_velocity_a_hand_jumps_over_no_wall(start):
+    model, clearance = _over_a_floor(), 0.02
+    pairs = [(f"g{i}", "wall") for i in range(3)]
+    follower = Follower(model, dt=0.01, q0=start, apart=pairs, clearance=clearance)
+    f = frame(model, "site", "tip")
+    for _ in range(200):
+        tick = follower.step([Position("tip", [0.95, 0, 0.6])])
+        assert f.pose(tick.q)[0, 3] < 0.58
+    assert not tick.followed and any("near wall" in what for what in tick.held)
+
+
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.integers(1, 8), st.integers(0, 14))
 def test_small_quadratic_programmes_meet_their_optimality_conditions(seed, n, k):

@@ -3,7 +3,7 @@
     least  sum w |J d + r|^2 + damping |d|^2   over the step d = v dt
     with   joint ranges with room to brake, |v| <= v_max, |v - v_before| <= a_max dt,
            n^T J d >= -share (distance - clearance)  for every named pair of geoms (velocity damper,
-           Faverjon & Tournassoud 1987)
+           Faverjon & Tournassoud 1987), and with room to brake
 
 A velocity v leaves room to brake before a limit at distance s when v^2 / 2a + v dt <= s; then the next tick
 has a velocity that does, too, so that ranges, velocities and accelerations never contradict each other. With
@@ -38,6 +38,9 @@ _HARD = 1e6  # weight of hard goals and loops over wishes of weight 1
 _LEAST = 1e-8  # damping; it grows where steps do not help, before goals that cannot be met
 _CLOSE, _GAIN = 1e-20, 1e-6  # a cost, and a relative change of it, that need no further linearisation
 _SHARE = 0.5  # of the distance to a geom that a tick may use up
+_RELIED = 0.5  # of the acceleration with which joints can part a pair: its derivative turns
+_BENT = 0.5  # of that more, where ways bend
+_FAR = 1e3  # [m] up to which geoms are seen: a tick without limits of velocity may be long
 _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when they contradict each other
 _ITERATIONS = 4  # linearisations a tick
 _CALM = 0.3  # of the greatest velocity, below which a configuration ahead counts as at rest
@@ -75,6 +78,13 @@ class _Point(NamedTuple):
     cost: float
 
 
+class _Least(NamedTuple):
+    """Of a pair of geoms after a tick [m]: the distance aimed at, and that below which a step is refused."""
+
+    aim: float
+    bar: float
+
+
 class Follower:
     """Follows goals that change from tick to tick, as in teleoperation.
 
@@ -84,7 +94,8 @@ class Follower:
         q0: start (nq,); default the model's qpos0.
         velocity, acceleration: limits (nv,) or one for all [rad/s or m/s, and per s]; None for no limit.
         joints: names of the joints that may move; default all that the goals depend on.
-        apart: pairs of geoms that keep `clearance` [m].
+        apart: pairs of geoms that keep `clearance` [m]. Exactly, where accelerations have no limits; with
+            limits joints brake ahead of a geom, but along it may use up a part where they slow each other.
 
     Raises ModelError for ticks or limits that are not positive, and names that do not exist.
     """
@@ -119,7 +130,7 @@ class Follower:
             limit("acceleration", acceleration, model.nv),
         )
         self.clearance = clearance
-        self.apart = Clearance(model, apart, reach=10 * clearance + 0.1) if apart else None
+        self.apart = Clearance(model, apart, reach=_FAR) if apart else None
         self.names = [f"{a} near {b}" for a, b in apart]
 
     def compile(self, goals: Sequence[Goal]) -> bool:
@@ -134,7 +145,7 @@ class Follower:
         columns = np.flatnonzero(problem.moved)
         before, low, high = self.q, *self._box()
         low, high = self._braked(problem, low, high)
-        allowed = self._allowed()
+        allowed = self._allowed(problem.moved)
         d = np.clip(np.zeros(self.model.nv), low, high)
         here, held = self._at(problem, self.space.step(before[None], d[None])[0], allowed), tuple[str, ...]()
         self._damping, began = min(self._damping, 1.0), here.cost
@@ -156,25 +167,26 @@ class Follower:
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
 
-    def _at(self, problem: Problem, q: Array, allowed: list[float]) -> _Point:
+    def _at(self, problem: Problem, q: Array, allowed: list[_Least]) -> _Point:
         """The goals' rows and the geoms' distances at q (nq,); walls that are passed cost most."""
         w = problem.weighted(problem.raw(q[None]))
         gaps = [] if self.apart is None else self.apart.gaps(q)
-        passed = max((least - gap.distance for gap, least in zip(gaps, allowed, strict=True)), default=0.0)
+        passed = max((x.bar - gap.distance for gap, x in zip(gaps, allowed, strict=True)), default=0.0)
         r, J = w.r[0], w.J[0]
         cost = float(r @ (r * np.where(problem.judged, 1.0, 1.0 / _HARD))) + 1e3 * max(0.0, passed)
         weight = _weights(problem)
         return _Point(q, r * weight, J * weight[:, None], gaps, cost)
 
     def _out_of_saddle(
-        self, problem: Problem, here: _Point, d: Array, low: Array, high: Array, allowed: list[float]
+        self, problem: Problem, here: _Point, d: Array, low: Array, high: Array, allowed: list[_Least]
     ) -> _Point:
         """A point beside q + d that costs less, where there is one along negative curvature; else `here`."""
         before, weight = self.q, _weights(problem)
         roomy = problem.moved & (low < d) & (d < high)
+        walls = self._walls(here, np.arange(self.model.nv), allowed)[:2]
         for free in (problem.moved, roomy):
             for way in ways_down(problem, here.q, weight, free):
-                most = _along(way, d, low, high)
+                most = _along(way, d, low, high, *walls)
                 for share in _SHORTER:
                     trial = d + share * most * way
                     there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
@@ -190,7 +202,7 @@ class Follower:
         d: Array,
         low: Array,
         high: Array,
-        allowed: list[float],
+        allowed: list[_Least],
     ) -> tuple[Array, tuple[str, ...]]:
         """Step (nv,) better than `d`, by the quadratic programme at q + d, and what holds it."""
         J = here.J[:, columns]
@@ -287,20 +299,26 @@ class Follower:
                     return there[0], _LEAST * _HARD
         return aim, damping
 
-    def _allowed(self) -> list[float]:
-        """Least distance of every pair of geoms after this tick (velocity damper)."""
-        if self.apart is None:
-            return []
-        spare = [gap.distance - self.clearance for gap in self.apart.gaps(self.q)]
-        return [self.clearance + (1 - _SHARE) * x for x in spare]
+    def _allowed(self, moved: NDArray[np.bool_]) -> list[_Least]:
+        """Least distance of every pair of geoms after this tick: a velocity damper that leaves room to brake."""
+        out = []
+        for gap in [] if self.apart is None else self.apart.gaps(self.q):
+            spare, ours = gap.distance - self.clearance, moved & (gap.J != 0)
+            closing = _SHARE * spare
+            if spare > 0 and ours.any():
+                a = np.array([_RELIED * (np.abs(gap.J[ours]) @ self.a_max[ours])])
+                closing = min(closing, self.dt * float(_braking(np.array([spare]), a, self.dt)[0]))
+            aim = gap.distance - closing
+            out.append(_Least(aim, aim - _BENT * abs(closing)))
+        return out
 
     def _walls(
-        self, here: _Point, columns: NDArray[np.intp], allowed: list[float]
+        self, here: _Point, columns: NDArray[np.intp], allowed: list[_Least]
     ) -> tuple[Array, Array, list[str]]:
         """Rows A d <= b that keep geoms apart, for pairs near enough to matter."""
         near = [x for x in zip(here.gaps, allowed, self.names, strict=False) if np.any(x[0].J)]
         A = np.array([-gap.J[columns] for gap, _, _ in near]).reshape(len(near), len(columns))
-        b = np.array([gap.distance - least for gap, least, _ in near])
+        b = np.array([gap.distance - least.aim for gap, least, _ in near])
         return A, b, [name for _, _, name in near]
 
     def _held(
@@ -317,11 +335,13 @@ def _weights(problem: Problem) -> Array:
     return np.where(problem.judged, np.sqrt(_HARD), 1.0)
 
 
-def _along(way: Array, d: Array, low: Array, high: Array) -> float:
-    """How far [rad or m] a step `d` can be lengthened along a unit direction between `low` and `high`."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(way > 0, (high - d) / way, np.where(way < 0, (low - d) / way, np.inf))
-    return max(0.0, min(_STRIDE, float(room[np.abs(way) > 1e-9].min(initial=np.inf))))
+def _along(way: Array, d: Array, low: Array, high: Array, A: Array, b: Array) -> float:
+    """How far [rad or m] a step `d` can be lengthened by x along a unit direction: between `low` and `high`,
+    and with A x <= b."""
+    towards = np.concatenate([way, -way, A @ way])
+    room = np.concatenate([high - d, d - low, b])
+    bound = towards > 1e-9
+    return max(0.0, min(_STRIDE, float((room[bound] / towards[bound]).min(initial=np.inf))))
 
 
 def limit(name: str, value: ArrayLike | None, nv: int) -> Array:
