@@ -245,12 +245,18 @@ def test_engines_agree_on_the_force_of_a_keyed_joint_with_an_actuator_of_its_own
         np.testing.assert_allclose(r.tau[:, 0], 2 * (r.a[:, 0] + G), atol=1e-5)
 
 
-def test_a_joint_that_starts_beyond_its_limit_is_put_on_it_and_told(tmp_path):
-    start = {"position": {"z": -0.6}}
-    plan = make_plan(scene_of(tmp_path, SLIDE, duration=0.1, initial=start))
+@pytest.mark.parametrize("solver", [{}, {"tolerance": 1e-8}])
+def test_a_joint_that_starts_beyond_its_limit_is_put_on_it_and_told(tmp_path, solver):
+    start = {"position": {"z": -0.6}, "velocity": {"z": -1.0}}
+    plan = make_plan(scene_of(tmp_path, SLIDE, duration=0.1, initial=start, solver=solver))
     assert any("'z' starts 0.1 m beyond its limit: it is put on it" in line for line in plan.left_out)
     r = run(plan)
-    assert np.all(r.q[1:, 0] == -0.5) and [(e.t, e.kind) for e in r.events] == [(0.0, "limit")]
+    assert np.all(r.q[:, 0] == -0.5) and [(e.t, e.kind) for e in r.events] == [(0.0, "limit")]
+    assert np.all(r.v[:, 0] == 0.0)
+    assert r.t[0] == 0.0 and (np.diff(r.t) > 0).all()
+    given = {"initial": start, "solver": solver, "physics": {"restitution": 0.5}}
+    r = run(make_plan(scene_of(tmp_path, SLIDE, duration=0.1, **given)))
+    assert (r.q[0, 0], r.v[0, 0]) == (-0.5, 0.5)
     inside = make_plan(scene_of(tmp_path, SLIDE, duration=0.1))
     assert not any("beyond its limit" in line for line in inside.left_out)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import EngineError
-from .interface import Array, Controls, Problem
+from .interface import Controls, Problem
 from .smooth_run import MOST, Run
 
 if TYPE_CHECKING:
@@ -42,12 +42,6 @@ class AdaptiveRun(Run):
                 return message
         self.keep(self.offset, self.q, self.v, self.act)
         return self.nonsense()
-
-    def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
-        """Record a state; of several at one moment the last."""
-        if self.samples and self.samples[-1][0] == self.t0 + offset:
-            del self.samples[-1], self.rests[-1]
-        super().keep(offset, q, v, act)
 
     def _until(self, stop: float, progress: Callable[[float], None] | None) -> str:
         """Go on to the offset ``stop``, from event to event."""

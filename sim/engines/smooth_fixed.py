@@ -123,6 +123,8 @@ class FixedRun(Run):
             self.move(moment.share, left)
             self.happen(moment)
             self.mark()
+            if self.samples[-1][0] == self.now:
+                self.keep(self.offset, self.q, self.v, self.act)
         raise EngineError(
             f"joints met their limits more than {MOST} times within one step at "
             f"t = {self.t0 + k * self.h:.4g} s; use a smaller step or engine = 'contact'"

@@ -145,7 +145,9 @@ class Run(ABC):
         self.ticks.append((self.now, self.held))
 
     def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
-        """Record a state."""
+        """Record a state; of several at one moment the last, from which the run goes on."""
+        if self.samples and self.samples[-1][0] == self.t0 + offset:
+            del self.samples[-1], self.rests[-1]
         self.rests.append(self.resting)  # first, so that an interrupt leaves no sample without it
         self.samples.append((self.t0 + offset, State(q.copy(), v.copy(), act.copy())))
 
