@@ -59,6 +59,22 @@ def test_named_geoms_are_kept_clear():
     assert clear[0] < 0.0 and clear[1] > 0.03
 
 
+def test_a_pose_that_overlaps_an_obstacle_is_told_and_fails(tmp_path):
+    """A ball around the only two ways of a planar arm; beside it, a goal that leaves it clear."""
+    path = tmp_path / "ball.xml"
+    path.write_text("""
+    <mujoco><compiler angle="radian"/><worldbody><geom name="ball" size=".15" pos=".4 0 0"/>
+    <body><joint name="a" axis="0 0 1"/><geom name="up" type="capsule" size=".03" fromto="0 0 0 .3 0 0"/>
+    <body pos=".3 0 0"><joint name="b" axis="0 0 1"/>
+    <geom name="fore" type="capsule" size=".03" fromto="0 0 0 .3 0 0"/><site name="tip" pos=".3 0 0"/></body>
+    </body></worldbody></mujoco>""")
+    code, text = _run(path, "--to", ".45,0,0", "--obstacle", "fore,ball")
+    assert code == 1
+    assert "not clear: fore and ball overlap by 0." in text
+    code, text = _run(path, "--to", "-.45,0,0", "--obstacle", "fore,ball")
+    assert code == 0 and "not clear" not in text
+
+
 @needs_gl
 def test_the_way_can_be_pictured(tmp_path):
     code, _ = _run("arm6", "--to", "0.4,0.1,0.4,0,1,0,0", "--film", tmp_path / "pose.png")

@@ -30,10 +30,14 @@ def ik(
     ] = None,
     keyframe: Annotated[str | None, typer.Option(help="Keyframe of the model to start from.")] = None,
     prefer: Annotated[
-        str | None, typer.Option(help="near (default), middle, manipulability, or clear of --obstacle.")
+        str | None,
+        typer.Option(help="Among poses: near (default), middle, manipulability, or clear of --obstacle."),
     ] = None,
     obstacle: Annotated[
-        list[str] | None, typer.Option(help="Pair of geoms that the pose stays clear of, as GEOM,GEOM.")
+        list[str] | None,
+        typer.Option(
+            help="Pair of geoms, GEOM,GEOM, kept apart as far as the goals allow; exit status 1 if they overlap."
+        ),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="List all distinct solutions.")] = False,
     film: Annotated[
@@ -49,15 +53,17 @@ def ik(
     loaded = load_model(model)
     start = _start(loaded, keyframe)
     goals = [_goal(loaded, site, to), *(_held(loaded, name, start) for name in hold or [])]
+    pairs = _pairs(loaded, obstacle)
     solution = solve(
         loaded, goals, q0=start, joints=_joints(loaded, joint),
-        prefer=_preference(prefer, obstacle), obstacles=_pairs(loaded, obstacle),  # type: ignore[arg-type]
+        prefer=_preference(prefer, obstacle), obstacles=pairs,  # type: ignore[arg-type]
         restarts=restarts, seed=seed, all=every,
     )  # fmt: skip
-    _show(loaded, solution, start)
+    overlaps = _overlaps(loaded, pairs, solution.q)
+    _show(loaded, solution, start, overlaps)
     if film is not None:
         console.print(f"film: {_film(loaded, goals[1:], start, solution.q, film)}")
-    if not solution.solved:
+    if overlaps or not solution.solved:
         raise typer.Exit(1)
 
 
@@ -114,6 +120,16 @@ def _pairs(model: Any, obstacles: list[str] | None) -> list[tuple[str, str]]:
     return out
 
 
+def _overlaps(model: Any, pairs: list[tuple[str, str]], q: Any) -> list[str]:
+    """Pairs that overlap at q (nq,), in words."""
+    from ..ik.collision import Clearance
+
+    if not pairs:
+        return []
+    gaps = zip(pairs, Clearance(model, pairs).gaps(q), strict=True)
+    return [f"{a} and {b} overlap by {-gap.distance:.3g} m" for (a, b), gap in gaps if gap.distance < 0]
+
+
 def _held(model: Any, name: str, start: Any) -> Goal:
     """The goal that a frame stays as it is at the start (nq,)."""
     from ..ik import Pose
@@ -149,9 +165,11 @@ def _goal(model: Any, site: str | None, to: str) -> Goal:
     return Position(site, numbers) if len(numbers) == 3 else Pose(site, numbers[:3], numbers[3:])
 
 
-def _show(model: Any, solution: Solution, start: Any) -> None:
-    color = "green" if solution.solved else "red"
+def _show(model: Any, solution: Solution, start: Any, overlaps: list[str]) -> None:
+    color = ("yellow" if overlaps else "green") if solution.solved else "red"
     console.print(f"[bold {color}]{escape(str(solution.verdict))}[/]", highlight=False, soft_wrap=True)
+    for words in overlaps:
+        console.print(f"[bold red]not clear: {escape(words)}[/]", highlight=False, soft_wrap=True)
     answers = solution.solutions if len(solution.solutions) > 1 else [solution.q]
     table = Table()
     table.add_column("joint")
