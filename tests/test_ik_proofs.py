@@ -1,5 +1,7 @@
 """Proofs of inverse kinematics: bounds hold at every configuration, and planar ones are attained."""
 
+from itertools import combinations
+
 import mujoco
 import numpy as np
 import pytest
@@ -79,8 +81,13 @@ def test_no_proof_excludes_what_some_configuration_has(model, seed):
     across = np.cross(rng.normal(size=3), x)
     others = [PointOnPlane(sites[0], p + across, x), PointOnLine(sites[0], p + x, x)]
     others.append(Distance(sites[0], p + x, float(np.linalg.norm(x))))
+    others.append(PointOnLine(sites[1], ik_cases.pose_of(model, q, sites[1])[0] - x, x))
+    others.append(PointOnPlane(sites[1], ik_cases.pose_of(model, q, sites[1])[0] + across, x))
     for goal in others:
         assert goal_gap(Problem(model, [goal], space), goal, start).position < 1e-7
+    for a, b in combinations(others + goals, 2):
+        gap = pair_gap(Problem(model, [a, b], space), a, b, start)
+        assert max(gap.position, gap.rotation) < 1e-7
     problem = Problem(model, goals, space)
     for goal in goals:
         gap = goal_gap(problem, goal, start)
@@ -257,3 +264,27 @@ def test_limits_of_a_wrist_arm_are_proved_by_its_closed_form():
     verdict = solve(model, goal).verdict
     assert (verdict.kind, verdict.proved) == ("held by limits", True)
     assert "waist" in verdict.joints
+
+
+def test_points_lines_and_planes_that_do_not_meet_are_proved():
+    """Of one point: parallel planes, a line along a plane, parallel and skew lines; of two, a link apart."""
+    arm = [([0, 0, 1], ik_cases.BALL, (0, 0, 1), None), ([0.5, 0, 0], ik_cases.HINGE, (0, 1, 0), None)]
+    model = ik_cases.chain([*arm, ([0.4, 0, 0], None, None, None)])
+    x, y, z = np.eye(3)
+    floor, line = PointOnPlane("tip", z, z), PointOnLine("tip", [0, 0.2, 1.0], x)
+    for goals, far in (
+        ([floor, PointOnPlane("tip", 1.25 * z, -z)], 0.25),
+        ([PointOnPlane("tip", 1.3 * z + y, z), line], 0.3),
+        ([line, PointOnLine("tip", [0.1, 0.2, 1.1], -x)], 0.1),
+        ([line, PointOnLine("tip", [0.1, 0.0, 1.1], y)], 0.1),
+        ([line, Position("tip", [0.5, 0.2, 1.1])], 0.1),
+        ([floor, Position("tip", [0.3, 0.2, 1.2])], 0.2),
+        ([PointOnPlane("at1", 0.8 * z, z), PointOnPlane("tip", 1.3 * z, z)], 0.1),  # a link of 0.4 between
+    ):
+        assert all(solve(model, goal).solved for goal in goals)
+        for order in (goals, goals[::-1]):
+            verdict = solve(model, order).verdict
+            assert (verdict.kind, verdict.proved, len(verdict.goals)) == ("conflict", True, 2)
+            assert verdict.bound == pytest.approx(far, abs=1e-12)
+    for goals in ([floor, line], [line, PointOnPlane("tip", [0.3, 0, 0], x)]):
+        assert solve(model, goals).solved

@@ -36,7 +36,7 @@ def ik(
     obstacle: Annotated[
         list[str] | None,
         typer.Option(
-            help="Pair of geoms, GEOM,GEOM, kept apart as far as the goals allow; exit status 1 if they overlap."
+            help="Geoms GEOM,GEOM to keep apart as far as the goals allow; exit status 1 if they overlap."
         ),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="List all distinct solutions.")] = False,

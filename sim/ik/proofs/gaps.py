@@ -20,7 +20,11 @@ from .balls import mass_gap, mirror_gap, sight_gap
 from .reach import at_point, offset, path, reach, turning_gap
 
 Array = NDArray[np.float64]
+Place = Position | Pose | PointOnLine | PointOnPlane
+PLACES = (Position, Pose, PointOnLine, PointOnPlane)
 _BOXES = 40_000
+_PARALLEL = 1e-12  # sine of an angle
+_ROUNDING = 1e-12  # [m]
 _DEEP = 24
 
 
@@ -136,15 +140,19 @@ def _surface_gap(problem: Problem, goal: PointOnPlane | PointOnLine, q: Array) -
 
 def pair_gap(problem: Problem, a: Goal, b: Goal, q: Array) -> Gap:
     """Least sum of violations of two goals, where the chain between their frames proves one."""
-    if isinstance(a, (Position, Pose)) and isinstance(b, (Position, Pose)) and _same_base(a, b):
-        targets = [np.asarray(g.target if isinstance(g, Position) else g.position) for g in (a, b)]
-        frames = [problem.kinematics.frame(g.at) for g in (a, b)]
-        hops = path(frames[0], frames[1], problem.space, problem.moved, q)
+    if isinstance(a, PLACES) and isinstance(b, PLACES) and a.relative_to == b.relative_to:
+        hops = path(*(problem.kinematics.frame(g.at) for g in (a, b)), problem.space, problem.moved, q)
+        points = isinstance(a, (Position, Pose)) and isinstance(b, (Position, Pose))
         if hops is not None:
-            gap = reach(hops).gap(float(np.linalg.norm(targets[0] - targets[1])))
-            if gap > 0:
-                return Gap(gap, 0.0, "the chain between their frames")
-    if isinstance(a, (Orientation, Pose)) and isinstance(b, (Orientation, Pose)) and _same_base(a, b):
+            bounds, apart = reach(hops), _apart(a, b)
+            gap = bounds.gap(apart) if points else max(0.0, apart - bounds.high)
+            if gap > _ROUNDING:
+                return Gap(gap, 0.0, "the chain between their frames" if a.at != b.at else "one point")
+    if (
+        isinstance(a, (Orientation, Pose))
+        and isinstance(b, (Orientation, Pose))
+        and a.relative_to == b.relative_to
+    ):
         return _turn_conflict(problem, a, b, q)
     if isinstance(a, JointValue) and isinstance(b, JointValue) and a.joint == b.joint and a.value != b.value:
         apart, slides = abs(a.value - b.value), a.units(problem.model) == ("m",)
@@ -152,8 +160,21 @@ def pair_gap(problem: Problem, a: Goal, b: Goal, q: Array) -> Gap:
     return NO_GAP
 
 
-def _same_base(a: Position | Orientation | Pose, b: Position | Orientation | Pose) -> bool:
-    return a.relative_to == b.relative_to
+def _apart(a: Place, b: Place) -> float:
+    """Distance of the points, lines or planes of two goals: what no direction in either closes."""
+    (p, U), (r, V) = _flat(a), _flat(b)
+    _, s, Vt = np.linalg.svd(np.concatenate([U, V, np.zeros((1, 3))]))
+    across = Vt[int(np.sum(s > _PARALLEL)) :]
+    return float(np.linalg.norm(across @ (p - r)))
+
+
+def _flat(goal: Place) -> tuple[Array, Array]:
+    """A point, and orthonormal rows (k, 3) along the point, line or plane."""
+    if isinstance(goal, PointOnPlane):
+        return np.asarray(goal.point), np.linalg.svd(np.asarray(goal.normal)[None])[2][1:]
+    if isinstance(goal, PointOnLine):
+        return np.asarray(goal.point), np.asarray(goal.direction)[None]
+    return np.asarray(goal.target if isinstance(goal, Position) else goal.position), np.zeros((0, 3))
 
 
 def _turn_conflict(problem: Problem, a: Orientation | Pose, b: Orientation | Pose, q: Array) -> Gap:
