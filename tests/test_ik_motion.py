@@ -88,18 +88,18 @@ def test_what_cannot_be_followed_is_told_with_its_reason():
     )
     assert len(out.missed) == 1
     assert out.missed[0].verdict.kind == "out of reach"
-    assert out.missed[0].verdict.proved
+    assert out.missed[0].verdict.proved and out.missed[0].stopped == "goals"
     far = np.hypot(1.5 + 0.5 * np.sin(np.pi * times), 0.2)
     assert out.missed[0].position == pytest.approx((far - 1.8).max(), abs=2e-3)
     fast = follow(
         model, lambda t: [Position("tip", [1.4 * np.cos(4 * t), 1.4 * np.sin(4 * t), 0])], times, velocity=1.0
     )
-    assert fast.missed and fast.missed[0].verdict is None
+    assert fast.missed and fast.missed[0].verdict is None and fast.missed[0].stopped == "velocity"
     assert fast.speed <= 1.0
     shaken = follow(
         model, lambda t: [Position("tip", [1.2 + 0.3 * np.sin(8 * t), 0.2, 0])], times, acceleration=10.0
     )
-    assert shaken.missed and 0.9 < shaken.effort <= 1.0
+    assert shaken.missed and 0.9 < shaken.effort <= 1.0 and shaken.missed[0].stopped == "acceleration"
     assert np.abs(np.diff(shaken.q, 2, axis=0)).max() / 0.05**2 <= 10.0
 
 
@@ -426,6 +426,43 @@ def test_without_limits_of_velocity_a_hand_jumps_over_no_wall(start):
         tick = follower.step([Position("tip", [0.95, 0, 0.6])])
         assert f.pose(tick.q)[0, 3] < 0.58
     assert not tick.followed and any("near wall" in what for what in tick.held)
+
+
+def test_without_limits_no_limit_is_told_to_be_the_reason():
+    """A path from one branch to another, and one that asks for infinite acceleration at its first instant."""
+    model, q = _straight(2)
+    corner = follow(model, lambda s: [Position("tip", [1 - 0.5 * s, 0, 0])], np.linspace(0, 1, 31), q0=q)
+    assert corner.position.max() > 1e-6
+    assert {missed.stopped for missed in corner.missed} <= {"smoothness", "jump"}
+    bounded = ik_cases.chain(
+        [([0, 0, 0], ik_cases.HINGE, (0, 0, 1), (-2.5, 2.5)), ([1, 0, 0], None, None, None)]
+    )
+    turning = lambda t: [Position("tip", [np.cos(t), np.sin(t), 0], tolerance=1e-3)]  # noqa: E731
+    around = follow(bounded, turning, np.linspace(0, 2 * np.pi, 61), q0=[0])
+    assert [(missed.stopped, missed.verdict) for missed in around.missed] == [("jump", None)]
+
+
+def test_a_tick_that_is_off_says_why():
+    model, q = _straight(2)
+    still = Follower(model, dt=0.01, q0=q, velocity=2.0, acceleration=20.0)
+    for _ in range(50):
+        out = still.step([Position("tip", [1.3, 0, 0])])
+    assert out.held == ("no step nearer",)
+    torn = Follower(model, dt=0.01, q0=[0.3, 0.5])
+    for _ in range(50):
+        between = torn.step([JointValue("j0", 0.1), JointValue("j0", 0.5)])
+    assert between.held == ("no step nearer",) and between.q[0] == pytest.approx(0.3)
+    fast = Follower(model, dt=0.01, q0=[0.3, 0.5], velocity=[0.1, np.inf])
+    assert fast.step([JointValue("j0", 1.0)]).held == ("j0",)
+    hard = Follower(model, dt=0.01, q0=[0.3, 0.5], acceleration=[np.inf, 0.1])
+    assert hard.step([JointValue("j0", 1.0), JointValue("j1", 1.0)]).held == ("j1",)
+    limited = ik_cases.chain(
+        [([0, 0, 0], ik_cases.HINGE, (0, 0, 1), (-0.5, 0.5)), ([1, 0, 0], None, None, None)]
+    )
+    ranged = Follower(limited, dt=0.01)
+    for _ in range(20):
+        tick = ranged.step([Position("tip", [0, 1, 0])])
+    assert tick.held == ("j0",)
 
 
 @settings(max_examples=40, deadline=None)

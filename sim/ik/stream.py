@@ -45,6 +45,7 @@ _SLACK, _PENALTY = 1e4, 1e7  # curvature and slope: walls give way only when the
 _ITERATIONS = 4  # linearisations a tick
 _CALM = 0.3  # of the greatest velocity, below which a configuration ahead counts as at rest
 _STRIDE = 0.5  # [rad or m] of one of them in search of where to brake, and out of a saddle
+_PUSHED, _EDGE = 1e-6, 1e-6  # share of a residual that a joint feels, and of its room, that count
 _SHORTER = (1.0, 0.1, 0.01)  # of it, that are tried
 _MOST = 1e6  # damping; that of a tick's first linearisation is at most 1
 
@@ -57,8 +58,10 @@ class Tick:
         q (nq,), v (nv,): configuration and velocity over the tick.
         residuals: of every goal there.
         followed: all judged goals are within their tolerance.
-        held: what kept it back: names of joints at a limit of range, velocity or acceleration, and pairs of
-            geoms; empty when nothing did.
+        held: why it was not followed, empty when it was: names of joints that the goals push against a limit
+            of range, velocity or acceleration (also one that makes them brake ahead), and pairs of geoms.
+            Where there are none, `"no step nearer"`: small steps bring the goals no nearer, as out of reach
+            or where goals contradict each other; or `"under way"`: the next tick gets nearer.
     """
 
     q: Array
@@ -147,25 +150,30 @@ class Follower:
         low, high = self._braked(problem, low, high)
         allowed = self._allowed(problem.moved)
         d = np.clip(np.zeros(self.model.nv), low, high)
-        here, held = self._at(problem, self.space.step(before[None], d[None])[0], allowed), tuple[str, ...]()
+        here, walls = self._at(problem, self.space.step(before[None], d[None])[0], allowed), tuple[str, ...]()
         self._damping, began = min(self._damping, 1.0), here.cost
         for _ in range(_ITERATIONS):
-            trial, why = self._programme(here, columns, d, low, high, allowed)
+            trial, near = self._programme(here, columns, d, low, high, allowed)
             there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
             better = there.cost < here.cost
             self._damping = min(max(self._damping * (0.03 if better else 30.0), _LEAST), _MOST)
-            held = why if better or not held else held
+            walls = near if better or not walls else walls
             if better:
                 gain, here, d = here.cost - there.cost, there, trial
                 if here.cost < _CLOSE or gain < _GAIN * here.cost:
                     break
         met = bool(problem.met(problem.raw(here.q[None]).r)[0])
         if not met and began - here.cost <= _GAIN * here.cost:
-            here = self._out_of_saddle(problem, here, d, low, high, allowed)
+            here, d = self._out_of_saddle(problem, here, d, low, high, allowed)
             met = bool(problem.met(problem.raw(here.q[None]).r)[0])
         self.q = here.q
         self.v = self.space.difference(self.q[None], before[None])[0] / self.dt
-        return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, () if met else held)
+        held = tuple[str, ...]()
+        if not met:
+            held = (*self._pushed(here, d, low, high), *walls)
+            still = began - here.cost <= _GAIN * here.cost
+            held = held or (("no step nearer",) if still else ("under way",))
+        return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, held)
 
     def _at(self, problem: Problem, q: Array, allowed: list[_Least]) -> _Point:
         """The goals' rows and the geoms' distances at q (nq,); walls that are passed cost most."""
@@ -179,8 +187,9 @@ class Follower:
 
     def _out_of_saddle(
         self, problem: Problem, here: _Point, d: Array, low: Array, high: Array, allowed: list[_Least]
-    ) -> _Point:
-        """A point beside q + d that costs less, where there is one along negative curvature; else `here`."""
+    ) -> tuple[_Point, Array]:
+        """A point beside q + d that costs less, where there is one along negative curvature, and the step
+        (nv,) to it; else `here` and `d`."""
         before, weight = self.q, _weights(problem)
         roomy = problem.moved & (low < d) & (d < high)
         walls = self._walls(here, np.arange(self.model.nv), allowed)[:2]
@@ -192,8 +201,8 @@ class Follower:
                     there = self._at(problem, self.space.step(before[None], trial[None])[0], allowed)
                     if there.cost < here.cost:
                         self._damping = _LEAST
-                        return there
-        return here
+                        return there, trial
+        return here, d
 
     def _programme(
         self,
@@ -204,7 +213,7 @@ class Follower:
         high: Array,
         allowed: list[_Least],
     ) -> tuple[Array, tuple[str, ...]]:
-        """Step (nv,) better than `d`, by the quadratic programme at q + d, and what holds it."""
+        """Step (nv,) better than `d`, by the quadratic programme at q + d, and pairs of geoms in its way."""
         J = here.J[:, columns]
         A, b, names = self._walls(here, columns, allowed)
         n, k = len(columns), len(b)
@@ -220,7 +229,8 @@ class Follower:
         found = minimise(H, g, rows[bounded], room[bounded])
         out = d.copy()
         out[columns] = np.clip(d[columns] + found.x[:n], low[columns], high[columns])
-        return out, self._held(columns, np.flatnonzero(bounded)[list(found.active)], n, names)
+        active = np.flatnonzero(bounded)[list(found.active)] - 2 * n
+        return out, tuple(names[i] for i in active if 0 <= i < k)
 
     def _box(self) -> tuple[Array, Array]:
         """Least and greatest step (nv,) that ranges, velocities and accelerations allow."""
@@ -300,7 +310,7 @@ class Follower:
         return aim, damping
 
     def _allowed(self, moved: NDArray[np.bool_]) -> list[_Least]:
-        """Least distance of every pair of geoms after this tick: a velocity damper that leaves room to brake."""
+        """Least distance of every pair of geoms after this tick: a damper that leaves room to brake."""
         out = []
         for gap in [] if self.apart is None else self.apart.gaps(self.q):
             spare, ours = gap.distance - self.clearance, moved & (gap.J != 0)
@@ -321,13 +331,13 @@ class Follower:
         b = np.array([gap.distance - least.aim for gap, least, _ in near])
         return A, b, [name for _, _, name in near]
 
-    def _held(
-        self, columns: NDArray[np.intp], active: NDArray[np.intp], n: int, names: list[str]
-    ) -> tuple[str, ...]:
-        mask = np.zeros(self.model.nv, dtype=bool)
-        mask[columns[active[active < 2 * n] % n]] = True
-        walls = active[(active >= 2 * n) & (active < 2 * n + len(names))] - 2 * n
-        return (*freedom_names(self.model, mask), *(names[i] for i in walls))
+    def _pushed(self, here: _Point, d: Array, low: Array, high: Array) -> tuple[str, ...]:
+        """Names of joints at an end of `low` to `high` (nv,) that would go further for the goals."""
+        slope, J = here.J.T @ here.r, np.linalg.norm(here.J, axis=0)
+        counts = np.abs(slope) > _PUSHED * J * np.linalg.norm(here.r)
+        edge = _EDGE * np.minimum(high - low, 1.0)
+        outward = np.where(slope < 0, d >= high - edge, d <= low + edge)
+        return freedom_names(self.model, counts & outward)
 
 
 def _weights(problem: Problem) -> Array:

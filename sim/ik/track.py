@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -44,18 +45,33 @@ _ROUNDING = 1e-9  # of a limit
 _WALL = 100.0  # weight of the limit of a ball joint beside that of goals
 _SETTLED = 15  # programmes from a motion that is nearly right
 _LAST, _SMALL = 4, 1e-3  # steps that may still meet goals exactly, and their greatest length [rad or m]
+_USED = 0.9  # of a limit, from which it counts as used up
+_JUMP = 0.2  # [rad or m] from a motion, from which a configuration counts as elsewhere
 _TIGHTER = 4  # times that limits are drawn in until rotations keep them
+
+Stopped = Literal["goals", "velocity", "acceleration", "jump", "smoothness"]
 
 
 @dataclass(frozen=True)
 class Missed:
-    """A stretch of time in which goals were not followed, with the worst instant and why."""
+    """A stretch of time in which goals were not followed, with the worst instant and why.
+
+    Attributes:
+        start, end, worst: times [s].
+        position, rotation: deviation at the worst [m], [rad].
+        stopped: by what: "goals" that cannot be met there, as `verdict` tells; limits of "velocity" or
+            "acceleration" that are used up; a "jump", where the nearest configuration that meets them is too
+            far from the motion to be reached between two instants; else "smoothness", which weighs more
+            than what is left.
+        verdict: of the worst instant by itself; None where the goals can be met there.
+    """
 
     start: float
     end: float
     worst: float
     position: float
     rotation: float
+    stopped: Stopped
     verdict: Verdict | None
 
 
@@ -67,8 +83,7 @@ class Motion:
         t (k,), q (k, nq), v (k, nv), a (k, nv): instants, configurations, velocities and accelerations (with
             limits those of the curves, otherwise central differences).
         position, rotation (k,): deviation from the judged goals [m], [rad].
-        missed: stretches where they are not within tolerance; a verdict where the goals themselves cannot be
-            met there, none where limits of velocity or acceleration are the reason.
+        missed: stretches where they are not within tolerance, and what stopped it there.
         speed, effort: largest |velocity| and |acceleration| of the curves, at any time, over their limits; 0
             without limits.
     """
@@ -347,9 +362,9 @@ def _motion(line: _Line, c: Array, limits: Limits) -> Motion:
     position = np.array([max((r.position for r in rs), default=0.0) for rs in judged])
     rotation = np.array([max((r.rotation for r in rs), default=0.0) for rs in judged])
     off = np.array([not all(r.met for r in rs) for rs in judged])
-    missed = _stretches(line, q, off, position, rotation)
-    t, q, v, a, position, rotation = (frozen(x) for x in (line.t, q, v, a, position, rotation))
     clip = line.clip(c)
+    missed = _stretches(line, q, off, position, rotation, limits, clip)
+    t, q, v, a, position, rotation = (frozen(x) for x in (line.t, q, v, a, position, rotation))
     speed, effort = _ratios(clip, line.t, line.moved, limits)
     return Motion(line.model, t, q, v, a, position, rotation, missed, speed, effort, clip)
 
@@ -369,22 +384,33 @@ def _judged(problem: Problem, report: tuple[Residual, ...]) -> list[Residual]:
 
 
 def _stretches(
-    line: _Line, q: Array, off: NDArray[np.bool_], position: Array, rotation: Array
+    line: _Line,
+    q: Array,
+    off: NDArray[np.bool_],
+    position: Array,
+    rotation: Array,
+    limits: Limits,
+    clip: Clip,
 ) -> tuple[Missed, ...]:
     out = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(int)))
     for i, j in edges.reshape(-1, 2):
         k = int(i + np.argmax(position[i:j] + rotation[i:j]))
         once = solve(line.model, line.problems[k].goals, q0=q[k], joints=line.joints, restarts=60)
+        t, far = line.t, (float(position[k]), float(rotation[k]))
+        stopped: Stopped = "goals"
+        if once.solved:
+            around = t[max(i - 2, 0) : j + 2]
+            way = np.abs(line.space.difference(once.q[None], q[k : k + 1])).max()
+            stopped = _used_up(line, clip, around, limits) or ("jump" if way > _JUMP else "smoothness")
         verdict = None if once.solved else once.verdict
-        out.append(
-            Missed(
-                float(line.t[i]),
-                float(line.t[j - 1]),
-                float(line.t[k]),
-                float(position[k]),
-                float(rotation[k]),
-                verdict,
-            )
-        )
+        out.append(Missed(float(t[i]), float(t[j - 1]), float(t[k]), *far, stopped, verdict))
     return tuple(out)
+
+
+def _used_up(line: _Line, clip: Clip, t: Array, limits: Limits) -> Literal["velocity", "acceleration"] | None:
+    """Which limit of the motion is used up somewhere around times t (n,), most of all; None where neither."""
+    speed, effort = _ratios(clip, t, line.moved, limits)
+    if max(speed, effort) < _USED:
+        return None
+    return "velocity" if speed >= effort else "acceleration"
