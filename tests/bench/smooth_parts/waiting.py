@@ -93,8 +93,7 @@ def _told(name, bar, first, second, busy):
     detail = f"{1e3 * again[:-2].sum():.0f} ms of it imports and the model"
     yield told(f"second use, {name}: start of the process to a batch's rollout", again.sum(), "s", detail)
     built = np.array([x[:, -2:].sum(axis=1) for x in (first, second)])
-    detail = (
-        f"{1e3 * np.median(built[0]):.0f} ms to {1e3 * np.median(built[1]):.2g} ms; imports are as before"
-    )
+    detail = f"{1e3 * np.median(built[0]):.0f} ms to {1e3 * np.median(built[1]):.2g} ms; the whole process "
+    detail += f"{whole / again.sum():.2g}x, since imports are as before"
     r = float(np.median(built[0] / built[1]))
     yield at_least(f"second use quicker, {name}: building, compiling, first results", r, QUICKER, "x", detail)
