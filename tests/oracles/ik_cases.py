@@ -498,6 +498,25 @@ def conflict_beside_an_innocent_goal(rng):
     return Case("beside an innocent goal", model, goals, "conflict", labels=case.labels)
 
 
+def conflict_of_three(rng):
+    """A 3R arm to a point with a heading and a first joint's value: any two can be met, all three cannot."""
+    lengths = rng.uniform(0.3, 1.0, 3)
+    q = np.array(
+        [rng.uniform(-1.2, 1.2), rng.choice([-1, 1]) * rng.uniform(0.4, 2.2), rng.uniform(-1.2, 1.2)]
+    )
+    tip, heading = planar.forward(lengths, q)[-1], q.sum()
+    value = q[0] + rng.choice([-1, 1]) * rng.uniform(0.05, 0.6)
+    from_elbow = np.linalg.norm(tip - lengths[0] * np.array([np.cos(value), np.sin(value)]))
+    room = from_elbow - abs(lengths[1] - lengths[2]), lengths[1] + lengths[2] - from_elbow
+    others = planar.three_links_pose(lengths, tip, heading)[:, 0]
+    if min(room) < 0.01 or np.abs(planar.wrap(others - value)).min() < 0.02:
+        return conflict_of_three(rng)
+    goals = [Position("tip", [*tip, 0], name="place"), Orientation("tip", quat_z(heading), name="heading"),
+             JointValue("j0", value, name="value")]  # fmt: skip
+    labels = frozenset(["place", "heading", "value"])
+    return Case("three at once", planar_chain(lengths), goals, "conflict", labels=labels)
+
+
 REACHABLE = (reachable_pose, reachable_point, reachable_at_limit, reachable_stretched, reachable_wrist,
              reachable_several)  # fmt: skip
 BEYOND = (beyond_ring, beyond_plane, beyond_sphere, beyond_tilt, beyond_surface, beyond_heading, beyond_wrist)
@@ -517,6 +536,7 @@ CONFLICT = (
     conflict_value,
     conflict_of_two_in_three,
     conflict_beside_an_innocent_goal,
+    conflict_of_three,
 )
 
 

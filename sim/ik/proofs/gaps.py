@@ -141,7 +141,8 @@ def _surface_gap(problem: Problem, goal: PointOnPlane | PointOnLine, q: Array) -
 def pair_gap(problem: Problem, a: Goal, b: Goal, q: Array) -> Gap:
     """Least sum of violations of two goals, where the chain between their frames proves one."""
     if isinstance(a, PLACES) and isinstance(b, PLACES) and a.relative_to == b.relative_to:
-        hops = path(*(problem.kinematics.frame(g.at) for g in (a, b)), problem.space, problem.moved, q)
+        frames = problem.kinematics.frame(a.at), problem.kinematics.frame(b.at)
+        hops = path(frames[0], frames[1], problem.space, problem.moved, q)
         points = isinstance(a, (Position, Pose)) and isinstance(b, (Position, Pose))
         if hops is not None:
             bounds, apart = reach(hops), _apart(a, b)
