@@ -5,28 +5,42 @@ from __future__ import annotations
 import csv
 import json
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 
 from .hard_cases import HARD_CASES, HardCase
 from .recording import check_writable
+from .report_work import Apart, Error, Work, physics
 from .scene_work import is_free, scene_case, scene_references, scene_runners
-from .work_precision import SURE, Case, Motion, Reference, Row, Runner, by_method, sweep, trajectory_error
-from .work_runners import mujoco_reference, runners, smooth_or_none, smooth_reference
+from .work_precision import (
+    SURE,
+    Case,
+    Reference,
+    Row,
+    Runner,
+    by_method,
+    trajectory_error,
+)
+from .work_runners import (
+    FOREIGN,
+    check_engines,
+    mujoco_reference,
+    runners,
+    smooth_or_none,
+    smooth_reference,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .plan import Plan
     from .scene.schema import Scene
-
-Error: TypeAlias = Callable[[Motion], float]
-Apart: TypeAlias = Callable[[Motion, Motion], float]
 
 ENGINES = ("smooth", "mujoco", "scipy")
 TARGETS = (1e-3, 1e-6, 1e-9)
@@ -65,6 +79,7 @@ class Report:
         yardsticks: what errors are measured against.
         notes: what was left out, and why.
         measure: what `Row.error` and `Row.estimate` are, in words.
+        status: "done", or "interrupted" where rows are missing because somebody did not wait.
     """
 
     name: str
@@ -72,9 +87,11 @@ class Report:
     yardsticks: tuple[Yardstick, ...]
     notes: tuple[str, ...] = ()
     measure: str = "global error [rad, m]"
+    status: str = "done"
 
     def uncertainty(self, engine: str) -> float:
         """Error of the reference that an engine's rows are measured against."""
+        engine = physics(engine)
         return next((y.uncertainty for y in self.yardsticks if y.engine in ("", engine)), math.nan)
 
     def cheapest(self, target: float, *, engines: Sequence[str] = ()) -> Row | None:
@@ -145,6 +162,7 @@ class Report:
         content = {
             "name": self.name,
             "measure": self.measure,
+            "status": self.status,
             "references": [{k: _json(v) for k, v in asdict(y).items()} for y in self.yardsticks],
             "notes": list(self.notes),
             "recommendation": self.recommendation().splitlines(),
@@ -192,6 +210,7 @@ def report(
     *,
     engines: Sequence[str] = ENGINES,
     budget_s: float = 0.5,
+    limit_s: float = 120.0,
     progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Compare engines and methods on one motion.
@@ -200,28 +219,33 @@ def report(
         subject: a case, a hard case, a scene or its plan or file; a bare model swings from its first
             configuration for two seconds.
         out_dir: folder for table.csv, report.json, report.txt and report.png; nothing is written when None.
-        engines: of "smooth", "mujoco", "scipy" and "torch" (extra `torch`), for free motion. A scene with
-            keyed joints, servos, controllers or contacts runs on the smooth and the contact engine.
-        budget_s: a method is refined until a run costs that much processor time [s].
+        engines: of "smooth", "mujoco" (the contact engine), "scipy" and "torch" (extra `torch`); the latter
+            two get the smooth engine's equations. What cannot run the subject is named in the notes.
+        budget_s: a method is refined until a run costs that much processor time [s], once at least.
+        limit_s: no run begins after that much time on the clock [s]; what was left out is named.
         progress: told the method at work.
 
+    A KeyboardInterrupt, once there are references, ends it with what was measured and status "interrupted".
+
     Raises:
-        EngineError: an unknown engine, or a reference that did not reach its end.
+        EngineError: an unknown engine, torch that is missing, or a reference that did not reach its end.
         RecordingError: `out_dir` cannot be written to; told before any work.
         SceneError: a scene with mistakes.
     """
     if out_dir is not None:
         check_writable(Path(out_dir))
+    check_engines(engines)
+    work = Work(engines, budget_s, time.perf_counter(), limit_s, progress)
     if isinstance(subject, HardCase | Case | mujoco.MjModel):
-        result = _of_case(subject, engines, budget_s, progress)
+        result = _of_case(subject, work)
     else:
         plan = _plan(subject)
         if plan.engine.what == "kinematic":
             result = Report(scene_case(plan).name, (), (), (_KEYED,))
         elif is_free(plan):
-            result = _of_case(scene_case(plan), engines, budget_s, progress)
+            result = _of_case(scene_case(plan), work)
         else:
-            result = _of_scene(plan, budget_s, progress)
+            result = _of_scene(plan, work)
     if out_dir is not None:
         result.write(out_dir)
     return result
@@ -232,10 +256,14 @@ def hard_suite(
     *,
     engines: Sequence[str] = ENGINES,
     budget_s: float = 0.5,
+    limit_s: float = 120.0,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Report, ...]:
-    """`report` for each of HARD_CASES against its known end, one folder a case in `out_dir`."""
-    reports = []
+    """`report` for each of HARD_CASES against its known end, one folder a case in `out_dir`.
+
+    `limit_s` is each case's; after an interrupt, the report of the case at work is the last.
+    """
+    reports: list[Report] = []
     for hard in HARD_CASES:
         folder = None if out_dir is None else Path(out_dir) / hard.name.replace(" ", "_").replace("'", "")
 
@@ -243,7 +271,10 @@ def hard_suite(
             if progress is not None:
                 progress(f"{name}: {what}")
 
-        reports.append(report(hard, folder, engines=engines, budget_s=budget_s, progress=told))
+        found = report(hard, folder, engines=engines, budget_s=budget_s, limit_s=limit_s, progress=told)
+        reports.append(found)
+        if found.status == "interrupted":
+            break
     return tuple(reports)
 
 
@@ -253,33 +284,35 @@ def _plan(subject: Scene | Plan | str | Path) -> Plan:
     return subject if isinstance(subject, Plan) else make_plan(subject)
 
 
-def _of_case(
-    subject: Case | HardCase | mujoco.MjModel,
-    engines: Sequence[str],
-    budget_s: float,
-    progress: Callable[[str], None] | None,
-) -> Report:
+def _of_case(subject: Case | HardCase | mujoco.MjModel, work: Work) -> Report:
     hard = subject if isinstance(subject, HardCase) else None
     case = _case(subject)
+    work.tell("compiling")
     smooth, why = smooth_or_none(case.model)
-    notes = (f"no smooth engine: {why}",) if smooth is None else smooth.differences
+    notes = smooth.differences if smooth is not None else _without_smooth(why, work.engines)
     if hard is not None:
         error: Error = partial(hard.error, model=case.model)
         apart: Apart = partial(hard.apart, model=case.model)
         yardstick = Yardstick(hard.source, 1e-15)
     else:
+        work.tell("the reference")
         if smooth is not None:
             reference = smooth_reference(case, smooth)
         else:
             reference = mujoco_reference(case, case.duration / case.frames / 2**10)
         error, apart = _against(case, reference), partial(trajectory_error, case)
         yardstick = _yardstick(reference)
-    rows: list[Row] = []
-    for runner in runners(case, smooth, engines):
-        _tell(progress, runner)
-        rows += sweep(runner, error, apart, floor=yardstick.uncertainty, budget_s=budget_s)
+    found = runners(case, smooth, work.engines)
+    rows, left, status = work.sweeps(found, lambda _: (error, apart, yardstick.uncertainty))
     words = {} if hard is None else {"measure": f"error of {hard.observe} at the end, of its scale"}
-    return Report(case.name, tuple(rows), (yardstick,), notes, **words)
+    return Report(case.name, rows, (yardstick,), (*notes, *left), status=status, **words)
+
+
+def _without_smooth(why: str, engines: Sequence[str]) -> tuple[str, ...]:
+    """Notes on what a model without a smooth engine leaves out."""
+    others = [e for e in engines if e in FOREIGN]
+    notes = [f"no smooth engine: {why}"]
+    return (*notes, *(f"no {other}: it solves the smooth engine's equations" for other in others))
 
 
 def _case(subject: Case | HardCase | mujoco.MjModel) -> Case:
@@ -291,22 +324,24 @@ def _case(subject: Case | HardCase | mujoco.MjModel) -> Case:
     return Case("model", subject, data.qpos.copy(), data.qvel.copy(), 2.0)
 
 
-def _of_scene(plan: Plan, budget_s: float, progress: Callable[[str], None] | None) -> Report:
+def _of_scene(plan: Plan, work: Work) -> Report:
     case = scene_case(plan)
-    found, notes = scene_runners(plan, case)
-    engines = list(dict.fromkeys(runner.engine for runner in found))
-    references = scene_references(engines, plan, case, budget_s=4 * budget_s)
+    work.tell("compiling")
+    found, notes = scene_runners(plan, case, work.engines)
+    engines = list(dict.fromkeys(physics(runner.engine) for runner in found))
+    work.tell("the references")
+    references = scene_references(engines, plan, case, budget_s=4 * work.budget_s, until=work.half)
     if len(references) == 2:
         gap = trajectory_error(case, references["smooth"].motion, references["contact"].motion)
         notes.append(f"the physics of the two engines lie {gap:.2g} rad or m apart, beside the errors below")
-    rows: list[Row] = []
-    for runner in found:
-        _tell(progress, runner)
-        reference = references[runner.engine]
-        error, apart = _against(case, reference), partial(trajectory_error, case)
-        rows += sweep(runner, error, apart, floor=reference.uncertainty, budget_s=budget_s)
+
+    def measures(runner: Runner) -> tuple[Error, Apart, float]:
+        reference = references[physics(runner.engine)]
+        return _against(case, reference), partial(trajectory_error, case), reference.uncertainty
+
+    rows, left, status = work.sweeps(found, measures)
     sticks = tuple(_yardstick(r, engine) for engine, r in references.items())
-    return Report(case.name, tuple(rows), sticks, tuple(notes))
+    return Report(case.name, rows, sticks, (*notes, *left), status=status)
 
 
 def _yardstick(reference: Reference, engine: str = "") -> Yardstick:
@@ -315,11 +350,6 @@ def _yardstick(reference: Reference, engine: str = "") -> Yardstick:
 
 def _against(case: Case, reference: Reference) -> Error:
     return lambda motion: trajectory_error(case, motion, reference.motion)
-
-
-def _tell(progress: Callable[[str], None] | None, runner: Runner) -> None:
-    if progress is not None:
-        progress(f"{runner.engine} {runner.method} by {runner.knob}")
 
 
 def _stiffness(rows: Sequence[Row]) -> list[str]:

@@ -6,8 +6,9 @@ engines' physics lie apart (soft limits, friction) is told beside it.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,13 +23,17 @@ from .errors import EngineError
 from .integrate import TABLEAUS
 from .integrate.problems import constraints_of
 from .plan import Plan
-from .work_precision import TOLERANCES, Case, Motion, Reference, sure_until, trajectory_error
+from .scene_foreign import SceneForeign, problem_at, why_not_foreign
+from .work_precision import TOLERANCES, Case, Motion, Reference, Runner, sure_until, trajectory_error
+from .work_runners import FOREIGN
 
 FRAMES = 50
 TIGHT = 1e-12
 """Tolerance of the smooth engine's reference."""
 LONGEST = 0.1
 """Longest step that is tried [s]."""
+USUAL = ("dopri5", "rk4", "implicitfast", "dop853", "euler", "DOP853")
+"""Methods that are tried first, for when time runs out."""
 FINEST = {"smooth": "dop853", "contact": "rk4"}
 """The method of each engine's reference."""
 
@@ -66,22 +71,16 @@ class SceneWork:
         """The motion of the scene in steps of `setting` [s], or to that tolerance."""
         plan, case = self.plan, self.case
         by_steps = self.knob == "step"
-        # what friction is smoothed over follows from the step, also where it is no step
-        step = setting if by_steps else (plan.period or case.duration / case.frames) / 2**6
-        problem = replace(
-            plan.problem,
-            step=step,
-            tolerance=None if by_steps else setting,
-            integrator=self.method,
-            sample_every=round(case.duration / case.frames / step),
-            duration=case.duration,
-        )
+        problem = problem_at(plan, case, setting if by_steps else None)
+        problem = replace(problem, tolerance=None if by_steps else setting, integrator=self.method)
         controls = make_controls(plan.setup.scene, problem, plan.period)
         engine = make_engine(self.engine)
         try:
             segment = engine.run(problem, (0.0, case.duration), controls)
         except Broken as broken:  # at this setting
             segment = broken.segment
+        if segment.status == "interrupted":
+            raise KeyboardInterrupt
         q, v = (
             np.full((case.frames + 1, case.model.nq), np.nan),
             np.full((case.frames + 1, case.model.nv), np.nan),
@@ -112,33 +111,61 @@ def is_free(plan: Plan) -> bool:
     return not (keyed or driven or constraints_of(problem.model))
 
 
-def scene_runners(plan: Plan, case: Case) -> tuple[list[SceneWork], list[str]]:
-    """All methods of the engines that can run the scene, and why an engine cannot."""
-    found: list[SceneWork] = []
+def scene_runners(
+    plan: Plan, case: Case, engines: Sequence[str] = ("smooth", "mujoco")
+) -> tuple[list[Runner], list[str]]:
+    """Methods of the engines asked for that can run the scene, the usual ones first; and why others cannot.
+
+    "mujoco" is the contact engine here, under its own name.
+    """
+    found: dict[str, list[Runner]] = {}
     notes = []
-    for engine, methods in (("smooth", TABLEAUS), ("contact", INTEGRATORS)):
-        if engine == "smooth" and can_touch(plan.problem.model):
-            notes.append("no smooth engine: bodies may touch; without contacts it could run the scene")
+    for engine in ("smooth", "contact"):
+        asked = [e for e in engines if (e == "mujoco") == (engine == "contact")]
+        if not asked:
             continue
-        trial = SceneWork(plan, case, engine, FINEST[engine])
-        try:
-            trial.run(next(iter(trial.settings())))
-        except EngineError as error:
-            notes.append(f"no {engine} engine: {error}")
+        why = _why_not(engine, plan, case)
+        others = [e for e in asked if e != "smooth"] if engine == "smooth" else []
+        if why:
+            notes += [f"no {engine} engine: {why}"] if engine in asked or engine == "contact" else []
+            notes += [f"no {other}: it solves the smooth engine's equations; {why}" for other in others]
+            continue
+        if engine == "contact":
+            found[engine] = [SceneWork(plan, case, engine, name) for name in INTEGRATORS]
+        elif "smooth" in asked:
+            pairs = [name for name, tableau in TABLEAUS.items() if tableau.adaptive]
+            found["smooth"] = [SceneWork(plan, case, engine, name) for name in TABLEAUS]
+            found["smooth"] += [SceneWork(plan, case, engine, name, "tolerance") for name in pairs]
+        if others and (why := why_not_foreign(plan, case)):
+            notes += [f"no {other}: {why}" for other in others]
         else:
-            found += [SceneWork(plan, case, engine, name) for name in methods]
-            if engine == "smooth":
-                pairs = [name for name, tableau in TABLEAUS.items() if tableau.adaptive]
-                found += [SceneWork(plan, case, engine, name, "tolerance") for name in pairs]
-    return found, notes
+            found |= {e: [SceneForeign(plan, case, name) for name in FOREIGN[e]] for e in others}
+    rank = {name: k for k, name in enumerate(USUAL)}
+    ordered = sorted(
+        (r for each in found.values() for r in each), key=lambda r: rank.get(r.method, len(rank))
+    )
+    return ordered, notes
+
+
+def _why_not(engine: str, plan: Plan, case: Case) -> str:
+    """Why an engine cannot run the scene, found by its first step; empty when it can."""
+    if engine == "smooth" and can_touch(plan.problem.model):
+        return "bodies may touch; without contacts it could run the scene"
+    trial = SceneWork(plan, case, engine, FINEST[engine])
+    try:
+        trial.run(next(iter(trial.settings())))
+    except EngineError as error:
+        return str(error)
+    return ""
 
 
 def scene_references(
-    engines: Iterable[str], plan: Plan, case: Case, *, budget_s: float
+    engines: Iterable[str], plan: Plan, case: Case, *, budget_s: float, until: float = math.inf
 ) -> dict[str, Reference]:
     """The reference of each engine: two methods at a tight tolerance, where it has any; or steps that halve
-    until two runs agree to 1e-10, or one costs `budget_s`. Where contacts and limits make the last halving
-    hardly better than the one before, the larger difference is the uncertainty.
+    until two runs agree to 1e-10, one costs `budget_s`, or it is past `until` (`time.perf_counter`). Where
+    contacts and limits make the last halving hardly better than the one before, the larger difference is the
+    uncertainty.
 
     Raises:
         EngineError: a reference did not reach the end.
@@ -157,7 +184,8 @@ def scene_references(
             motions.append(runner.run(step))
             gaps.append(trajectory_error(case, *motions[-2:]))
             uncertainty = gaps[-1] if len(gaps) < 2 or gaps[-1] < 0.3 * gaps[-2] else max(gaps[-2:])
-            if uncertainty < 1e-10 or time.process_time() - began > budget_s:
+            dear = time.process_time() - began > budget_s or time.perf_counter() > until
+            if uncertainty < 1e-10 or dear:
                 break
         if not np.isfinite(uncertainty):
             raise EngineError(

@@ -159,6 +159,14 @@ def sure_until(case: Case, motion: Motion, other: Motion) -> float:
     return float(case.times[np.argmax(apart)]) if apart.any() else math.inf
 
 
+class Interrupted(KeyboardInterrupt):
+    """A KeyboardInterrupt in the middle of a sweep; `rows` is what was measured until then."""
+
+    def __init__(self, rows: list[Row]) -> None:
+        super().__init__()
+        self.rows = rows
+
+
 def sweep(
     runner: Runner,
     error: Callable[[Motion], float],
@@ -166,39 +174,60 @@ def sweep(
     *,
     floor: float,
     budget_s: float,
+    until: float = math.inf,
 ) -> list[Row]:
     """Rows of one method from coarse to fine; `apart` measures two motions as `error` does one.
 
     They end where the error is at `floor` or no longer falls by rounding, where a run costs `budget_s` or all
-    together four times that, and where one fails that is finer than one that did not.
+    together four times that, and where one fails that is finer than one that did not; but dear ones not
+    before there are two, whose difference is an estimate. No run begins after `until` (`perf_counter`).
     """
     rows: list[Row] = []
     motions: list[Motion] = []
-    first_s, stalled, total = 0.0, 0, 0.0
-    for n, setting in enumerate(runner.settings()):
-        wall = time.perf_counter()
-        motion, cpu = _timed(runner, setting)
-        if n == 0:
-            first_s = time.perf_counter() - wall
-            motion, cpu = _timed(runner, setting)
-        spent = cpu
-        for _ in range(4):
-            if spent > budget_s / 4:
+    stalled, total = 0, 0.0
+
+    def estimated() -> list[Row]:
+        found = _estimates(runner, motions, apart)
+        return [replace(row, estimate=estimate) for row, estimate in zip(rows, found, strict=True)]
+
+    try:
+        for setting in runner.settings():
+            if time.perf_counter() > until:
                 break
-            again = _timed(runner, setting)[1]
-            cpu, spent = min(cpu, again), spent + again
-        e, total = error(motion), total + spent
-        rows.append(
-            Row(runner.engine, runner.method, runner.knob, setting, e, cpu, first_s, motion.evaluations)
-        )
-        motions.append(motion)
-        best = min((row.error for row in rows[:-1] if np.isfinite(row.error)), default=np.inf)
-        stalled = stalled + 1 if best < ROUNDING and e >= best else 0
-        failed = not np.isfinite(e) and np.isfinite(best)
-        if cpu > budget_s or total > 4 * budget_s or e < floor or stalled == 2 or failed:
+            row, motion, spent = _measured(runner, setting, rows[0].first_s if rows else None, budget_s)
+            row = replace(row, error=error(motion))
+            total += spent
+            best = min((r.error for r in rows if np.isfinite(r.error)), default=np.inf)
+            rows, motions = [*rows, row], [*motions, motion]
+            stalled = stalled + 1 if best < ROUNDING and row.error >= best else 0
+            failed = not np.isfinite(row.error) and np.isfinite(best)
+            dear = len(rows) > 1 and (row.cpu_s > budget_s or total > 4 * budget_s)
+            if dear or row.error < floor or stalled == 2 or failed:
+                break
+    except KeyboardInterrupt as stop:
+        motions = motions[: len(rows)]
+        raise Interrupted(estimated()) from stop
+    return estimated()
+
+
+def _measured(
+    runner: Runner, setting: float, first_s: float | None, budget_s: float
+) -> tuple[Row, Motion, float]:
+    """A row without its error, the motion, and the processor time that all its runs took [s]."""
+    wall = time.perf_counter()
+    motion, cpu = _timed(runner, setting)
+    if first_s is None:
+        first_s = time.perf_counter() - wall
+        motion, cpu = _timed(runner, setting)
+    spent = cpu
+    for _ in range(4):
+        if spent > budget_s / 4:
             break
-    found = _estimates(runner, motions, apart)
-    return [replace(row, estimate=estimate) for row, estimate in zip(rows, found, strict=True)]
+        again = _timed(runner, setting)[1]
+        cpu, spent = min(cpu, again), spent + again
+    nan = float("nan")
+    row = Row(runner.engine, runner.method, runner.knob, setting, nan, cpu, first_s, motion.evaluations)
+    return row, motion, spent
 
 
 def _estimates(

@@ -16,7 +16,24 @@ from .integrate import TABLEAUS, Tableau, solve
 from .integrate.problems import constraints_of
 from .work_precision import TOLERANCES, Array, Case, Motion, Reference, Runner, sure_until, trajectory_error
 
-SCIPY = ("DOP853", "Radau", "LSODA")
+ENGINES = ("smooth", "mujoco", "scipy", "torch")
+"""What a report can compare."""
+FOREIGN = {"scipy": ("scipy:DOP853", "scipy:Radau", "scipy:LSODA"), "torch": ("torch:dopri5", "torch:dopri8")}
+"""Solvers that we did not write, by library."""
+
+
+def check_engines(engines: Sequence[str]) -> None:
+    """Raise EngineError for an engine that no report knows, and for torch where it is missing."""
+    for engine in engines:
+        if engine not in ENGINES:
+            raise EngineError(unknown("engine", engine, ENGINES, where="a report"))
+    if "torch" in engines:
+        try:
+            import torchdiffeq  # noqa: F401
+        except ImportError as missing:
+            raise EngineError(
+                f"engine 'torch' needs torchdiffeq: pip install 'pantograph-sim[torch]' ({missing})"
+            ) from missing
 
 
 def _steps(case: Case) -> list[float]:
@@ -177,18 +194,11 @@ def mujoco_reference(case: Case, step: float) -> Reference:
 
 
 def runners(case: Case, smooth: Smooth | None, engines: Sequence[str]) -> list[Runner]:
-    """All methods of the engines asked for: "smooth", "mujoco", "scipy", "torch".
-
-    Raises:
-        EngineError: an unknown engine.
-    """
+    """All methods of the engines asked for, those of MuJoCo alone where there is no smooth engine."""
     found: list[Runner] = []
     for engine in engines:
         if engine == "mujoco":
             found += [MujocoSteps(case, name) for name in INTEGRATORS]
-        elif engine not in ("smooth", "scipy", "torch"):
-            known = ("smooth", "mujoco", "scipy", "torch")
-            raise EngineError(unknown("engine", engine, known, where="a report"))
         elif smooth is None:
             continue
         elif engine == "smooth":
@@ -196,8 +206,7 @@ def runners(case: Case, smooth: Smooth | None, engines: Sequence[str]) -> list[R
             pairs = (tableau for tableau in TABLEAUS.values() if tableau.adaptive)
             found += [SmoothTolerances(case, smooth, tableau) for tableau in pairs]
         else:
-            names = [f"scipy:{name}" for name in SCIPY] if engine == "scipy" else ["torch:dopri5"]
-            found += [Foreign(case, smooth, name) for name in names]
+            found += [Foreign(case, smooth, name) for name in FOREIGN[engine]]
     return found
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from dataclasses import replace
 
 import mujoco
@@ -273,9 +274,138 @@ def test_a_scene_with_a_controller_runs_on_both_engines(tmp_path):
 def test_report_on_a_scene_with_a_controller(tmp_path):
     (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
     result = report(tmp_path / "tracked.toml", budget_s=0.0)
-    assert {r.engine for r in result.rows} == {"smooth", "contact"}
+    assert {r.engine for r in result.rows} == {"smooth", "contact", "scipy"}
     assert {y.engine for y in result.yardsticks} == {"smooth", "contact"}
     assert any("physics of the two engines" in note for note in result.notes)
+
+
+KEYED = (
+    SCENE.replace("[initial.position]\nshoulder = 60\n", "")
+    + """
+[[keys]]
+joint = "shoulder"
+times = [0, 0.25, 0.4]
+values = [60, 20, 50]
+curve = "{curve}"
+"""
+)
+
+
+@pytest.mark.parametrize(
+    "words", [SCENE + TRACKED, KEYED.format(curve="natural"), KEYED.format(curve="auto")]
+)
+@pytest.mark.parametrize("engine", ["scipy", "torch"])
+def test_solvers_that_we_did_not_write_agree_on_scenes(tmp_path, words, engine):
+    """On keyed motion that bends at its keys, and on the samples that a controller holds."""
+    if engine == "torch":
+        pytest.importorskip(
+            "torchdiffeq", reason="torchdiffeq is not installed: pip install 'pantograph-sim[torch]'"
+        )
+    (tmp_path / "scene.toml").write_text(words)
+    plan = make_plan(load_scene(tmp_path / "scene.toml"))
+    case = scene_case(plan)
+    found, notes = scene_runners(plan, case, (engine,))
+    assert not notes and {runner.engine for runner in found} == {engine}
+    reference = scene_references(("smooth",), plan, case, budget_s=0.2)["smooth"]
+    for runner in found:
+        coarse, fine = (trajectory_error(case, runner.run(tol), reference.motion) for tol in (1e-3, 1e-9))
+        assert coarse < 0.1 and fine < 1e-6 and fine < coarse + 1e-9, (runner.name, coarse, fine)
+
+
+def test_what_is_left_out_is_told(tmp_path):
+    """Limits that are met and velocities that jump leave foreign solvers out, as contacts do."""
+    (tmp_path / "jumps.toml").write_text(KEYED.format(curve="linear"))
+    (tmp_path / "rail.toml").write_text(
+        LIMITED.replace("120", "1.2").replace("2.0", "2.0\n[initial.velocity]\nslide = 5.0")
+    )
+    for name, why in (
+        ("jumps", "no scipy: keyed velocities jump"),
+        ("rail", "no scipy: joint 'slide' meets"),
+    ):
+        plan = make_plan(load_scene(tmp_path / f"{name}.toml"))
+        found, notes = scene_runners(plan, scene_case(plan), ("smooth", "scipy"))
+        assert {runner.engine for runner in found} == {"smooth"}
+        assert len(notes) == 1 and why in notes[0], notes
+    (tmp_path / "free.toml").write_text(LIMITED.replace("120", "0.1"))
+    plan = make_plan(load_scene(tmp_path / "free.toml"))
+    found, notes = scene_runners(plan, scene_case(plan), ("scipy",))
+    assert found and not notes, "limits that no motion meets are none"
+    box = report(mujoco.MjModel.from_xml_string(BOX), engines=("mujoco", "scipy"), budget_s=0.0, limit_s=0.5)
+    assert any("no scipy: it solves the smooth engine's equations" in note for note in box.notes)
+
+
+def test_engines_are_chosen(tmp_path):
+    (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
+    result = report(tmp_path / "tracked.toml", engines=("mujoco",), budget_s=0.0)
+    assert {r.engine for r in result.rows} == {"contact"}
+    only = report(tmp_path / "tracked.toml", engines=("scipy",), budget_s=0.0)
+    assert {r.engine for r in only.rows} == {"scipy"} and only.cheapest(1e-3) is not None
+    with pytest.raises(EngineError, match="did you mean 'torch'"):
+        report(tmp_path / "tracked.toml", engines=("torhc",))
+
+
+def test_missing_torch_is_said_before_any_work(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchdiffeq", None)
+    with pytest.raises(
+        EngineError, match=r"engine 'torch' needs torchdiffeq: pip install 'pantograph-sim\[torch"
+    ):
+        report(swing(), engines=("torch",), progress=lambda _: pytest.fail("worked in vain"))
+
+
+def test_time_that_runs_out_is_told():
+    result = report(swing(), engines=("smooth", "mujoco"), limit_s=0.0)
+    assert not result.rows and result.status == "done"
+    assert any("no time was left for smooth euler" in note and "mujoco" in note for note in result.notes)
+
+
+def test_an_interrupted_report_keeps_what_it_measured(tmp_path):
+    """Whoever does not wait has the methods so far, and the settings so far of the one at work."""
+    case = swing()
+    smooth = smooth_or_none(case.model)[0]
+    whole = runners(case, smooth, ("smooth",))
+    told: list[str] = []
+
+    class Impatient(type(whole[0])):
+        def run(self, setting):
+            if self.method == "rk4" and setting < 0.03:
+                raise KeyboardInterrupt
+            return super().run(setting)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pantograph.sim.work_runners.SmoothSteps", Impatient)
+        result = report(case, tmp_path, engines=("smooth",), budget_s=0.01, progress=told.append)
+    assert result.status == "interrupted"
+    kept = [r for r in result.rows if r.method == "rk4"]
+    assert [r.setting for r in kept] == [0.1, 0.05] and np.isfinite([r.estimate for r in kept]).all()
+    assert {"euler", "rk4"} <= {r.method for r in result.rows} and "dop853" not in {
+        r.method for r in result.rows
+    }
+    assert any("interrupted during or before smooth rk4" in note for note in result.notes)
+    assert json.loads((tmp_path / "report.json").read_text())["status"] == "interrupted"
+    assert f"(1 of {len(whole)})" in " ".join(told)
+
+
+def test_interrupts_in_an_engine_reach_the_report(tmp_path, monkeypatch):
+    """Engines end with the status 'interrupted'; that is no motion that diverged."""
+    (tmp_path / "tracked.toml").write_text(SCENE + TRACKED)
+    plan = make_plan(load_scene(tmp_path / "tracked.toml"))
+    found, _ = scene_runners(plan, scene_case(plan), ("smooth", "mujoco"))
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pantograph.sim.compose.Sampled.sample", stop)
+    for runner in (found[0], next(r for r in found if r.engine == "contact")):
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(0.01)
+
+
+def test_dear_runs_come_in_pairs():
+    """One run says nothing of its error."""
+    result = report(swing(), engines=("smooth",), budget_s=0.0)
+    methods = {(r.method, r.knob) for r in result.rows}
+    assert len(result.rows) == 2 * len(methods)
+    assert all(np.isfinite(r.estimate) for r in result.rows)
 
 
 LIMITED = """

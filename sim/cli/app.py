@@ -225,6 +225,12 @@ def report(
     scene: Annotated[Path | None, typer.Argument(help="Scene file (TOML).")] = None,
     suite: Annotated[str | None, typer.Option(help="A suite of cases with known ends: 'hard'.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for tables (CSV, JSON, text) and figures.")] = Path("out"),
+    engines: Annotated[
+        str, typer.Option(help="Of smooth, mujoco, scipy, torch, with commas between them.")
+    ] = "smooth,mujoco,scipy",
+    limit: Annotated[
+        float, typer.Option(help="Seconds after which no run begins (of each case of a suite).", min=0)
+    ] = 120.0,
 ) -> None:
     """Error against cost: engines and methods over steps and tolerances, with a recommendation."""
     from ..report import hard_suite
@@ -234,15 +240,18 @@ def report(
         raise PantographError("give a scene file, or --suite hard")
     if suite not in (None, "hard"):
         raise PantographError(f"there is no suite {suite!r}; there is: hard")
+    names = tuple(name.strip() for name in engines.split(","))
+    folder = out / ("hard" if scene is None else f"{scene.stem}-report")
     with show.status("comparing methods") as tell:
         if scene is None:
-            folder, reports = out / "hard", hard_suite(out / "hard", progress=tell)
+            reports = hard_suite(folder, engines=names, limit_s=limit, progress=tell)
         else:
-            folder = out / f"{scene.stem}-report"
-            reports = (compare(scene, folder, progress=tell),)
+            reports = (compare(scene, folder, engines=names, limit_s=limit, progress=tell),)
     for each in reports:
         typer.echo(each.brief())
     console.print(f"report: {folder}")
+    if reports[-1].status == "interrupted":
+        raise typer.Exit(130)
 
 
 @app.command(epilog="Example: pantograph schema > scene.schema.json")
