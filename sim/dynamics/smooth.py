@@ -9,6 +9,7 @@ Nothing is compiled before it is asked for; what was compiled once is found on d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path as FilePath
@@ -258,7 +259,8 @@ class Smooth(Machine):
         """
         tableau, (relative, absolute) = tableau_of(method, where="integrate"), tolerances(rtol, atol)
         times = np.ascontiguousarray(t_eval, dtype=np.float64)
-        if times.ndim != 1 or len(times) < 2 or not (times[1:] > times[:-1]).all() or np.isinf(times).any():
+        ascending = times.ndim == 1 and len(times) > 1 and (times[1:] > times[:-1]).all()
+        if not (ascending and math.isfinite(times[0]) and math.isfinite(times[-1])):
             raise EngineError("t_eval must hold two or more ascending, finite times")
         for name, value in (("hold", hold), ("first_step", first_step)):
             if value is not None:

@@ -207,7 +207,7 @@ def tolerances(rtol: float | None, atol: float | Array | None) -> tuple[float, A
     if rtol is None:
         rtol = 1e-6 if atol is None else float(np.min(atol))
     absolute = np.asarray(rtol if atol is None else atol, dtype=np.float64)
-    if not (0 <= rtol < np.inf and np.all((absolute > 0) & (absolute < np.inf))):
+    if not (0 <= rtol < math.inf and absolute.min() > 0 and absolute.max() < math.inf):
         raise EngineError(f"rtol={rtol}, atol={atol}: atol must be positive, rtol not negative, both finite")
     if 0 < rtol < 10 * EPS:
         raise EngineError(f"rtol={rtol} is below what doubles resolve: give at least {10 * EPS:.1e}")
