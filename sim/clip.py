@@ -11,6 +11,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from ..models.naming import joint_names, lookup, name_of
 from .curves import Array, Curve, frozen
 from .errors import KeyingError, unknown
 from .rotation_curves import RotationCurve
@@ -50,7 +51,8 @@ class Clip:
     """Keyed motion of `model`: `tracks` by joint name, and `q0` (nq,), where everything else stays.
 
     Hinge and slide joints take a curve of one number, ball joints a RotationCurve, free joints a FreeTrack.
-    `q0` defaults to the model's `qpos0`. Raises KeyingError listing every track that does not fit.
+    A joint without a name goes by its number, as `joint3`. `q0` defaults to the model's `qpos0`. Raises
+    KeyingError listing every track that does not fit.
     """
 
     def __init__(self, model: mujoco.MjModel, tracks: Mapping[str, Track], q0: ArrayLike | None = None):
@@ -126,7 +128,7 @@ class Clip:
     def _channels(self) -> tuple[_Channel, ...]:
         channels = []
         for name, track in self.tracks.items():
-            joint = self.model.joint(name).id
+            joint = lookup(self.model, "joint", name)
             q, v = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
             if not isinstance(track, FreeTrack):
                 channels.append(_Channel(track, slice(q, q + track.dim), slice(v, v + track.dof)))
@@ -139,10 +141,10 @@ class Clip:
 
     def _mistake(self, name: str, track: Track) -> str | None:
         """What is wrong with a track, or None."""
-        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, name)
-        if joint < 0:
-            return unknown("joint", name, _joint_names(self.model))
-        kind = int(self.model.jnt_type[joint])
+        names = joint_names(self.model)
+        if name not in names:
+            return unknown("joint", name, names)
+        kind = int(self.model.jnt_type[names.index(name)])
         if kind == _FREE:
             if not isinstance(track, FreeTrack):
                 fits, needs = False, "a FreeTrack of a position and a rotation curve"
@@ -193,7 +195,7 @@ def _ties(model: mujoco.MjModel) -> list[_Tie]:
         joint1, joint2 = model.eq_obj1id[e], model.eq_obj2id[e]
         if joint2 < 0:
             continue
-        name1, name2 = model.joint(joint1).name, model.joint(joint2).name
+        name1, name2 = (name_of(model, "joint", int(j)) for j in (joint1, joint2))
         rest1, rest2 = model.qpos0[model.jnt_qposadr[[joint1, joint2]]]
         c = Polynomial(model.eq_data[e, :5])
         ties.append(_Tie(name1, name2, rest1 + c(Polynomial([-rest2, 1.0]))))
@@ -209,10 +211,6 @@ def _follow(leader: Track, polynomial: Polynomial) -> CoupledCurve:
     assert isinstance(leader, Curve)
     values = frozen(polynomial(leader.values))
     return CoupledCurve(leader.times, values, leader.knots, leader.before, leader.after, leader, polynomial)
-
-
-def _joint_names(model: mujoco.MjModel) -> list[str]:
-    return [name for i in range(model.njnt) if (name := model.joint(i).name)]
 
 
 def _mask(n: int, columns: list[slice]) -> NDArray[np.bool_]:

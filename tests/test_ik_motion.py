@@ -18,6 +18,7 @@ from pantograph.sim.ik import (
     Posture,
     blend,
     follow,
+    lock,
     soften,
     solve,
 )
@@ -463,6 +464,21 @@ def test_a_tick_that_is_off_says_why():
     for _ in range(20):
         tick = ranged.step([Position("tip", [0, 1, 0])])
     assert tick.held == ("j0",)
+
+
+def test_joints_without_names_are_followed_and_locked_too():
+    joint = '<joint axis="0 0 1"/><geom size=".01"/>'
+    legs = f'<body>{joint}<body pos=".5 0 0">{joint}<site name="tip" pos=".5 0 0"/></body></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{legs}</worldbody></mujoco>")
+    motion = follow(model, lambda s: [Position("tip", [0.3, 0.3 + 0.1 * s, 0])], np.linspace(0, 1, 11))
+    assert motion.followed
+    curves = motion.clip()
+    assert set(curves.tracks) == {"joint0", "joint1"}
+    np.testing.assert_allclose(curves.evaluate(motion.t).q, motion.q, atol=1e-9)
+    locked = lock(
+        model, np.linspace(0, 1, 21), np.linspace([0.1, 0.2], [0.3, 0.5], 21), {"tip": [(0.3, 0.6)]}
+    )
+    assert locked.met.all()
 
 
 @settings(max_examples=40, deadline=None)
