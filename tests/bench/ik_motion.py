@@ -70,17 +70,25 @@ def figure():
     begin = time.thread_time()
     whole = follow(arm, goals, np.arange(0, 4, dt), q0=q, velocity=speed, acceleration=effort)
     spent = time.thread_time() - begin
-    steps = np.diff(whole.q, axis=0) / dt
+    fastest, hardest = finely(whole)
     return [
         at_most("figure-eight live: joint speed over its limit", worst_v / speed, 1 + 1e-9, "ratio"),
         at_most("figure-eight live: acceleration over its limit", worst_a / effort, 1 + 1e-6, "ratio"),
         at_most("figure-eight live: deviation not reported", untold, 1e-9, "m"),
         told("figure-eight live: largest deviation", 1e3 * far, "mm"),
         told("figure-eight live: time a tick", 1e3 * each, "ms"),
-        at_most("figure-eight whole: joint speed over its limit", np.abs(steps).max() / speed, 1 + 1e-9,
-                "ratio"),
-        at_most("figure-eight whole: acceleration over its limit",
-                np.abs(np.diff(steps, axis=0)).max() / dt / effort, 1 + 1e-6, "ratio"),
+        at_most("figure-eight whole: joint speed over its limit", fastest / speed, 1 + 1e-9, "ratio"),
+        at_most("figure-eight whole: acceleration over its limit", hardest / effort, 1 + 1e-6, "ratio"),
         told("figure-eight whole: largest deviation", 1e3 * whole.position.max(), "mm"),
         told("figure-eight whole: time", spent, "s"),
     ]  # fmt: skip
+
+
+def finely(motion):
+    """Largest joint speed and acceleration on a motion's curve, at every millisecond and on both sides of
+    every break of the curve: between breaks the acceleration is straight."""
+    clip = motion.clip()
+    times = np.linspace(clip.start, clip.end, round((clip.end - clip.start) * RATE) + 1)
+    times = np.concatenate([times, clip.breaks])
+    sides = [clip.evaluate(times, left=left) for left in (False, True)]
+    return (max(float(np.abs(getattr(side, word)).max()) for side in sides) for word in ("v", "a"))
