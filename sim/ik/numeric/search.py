@@ -71,13 +71,18 @@ class Search:
             found.append(self._attempt(starts, iterations=40, first=True))
             end = self._all[-1]
             self.direct = bool(end.met[0]) and self._near(end.q[:1])
+        blocks = iter(_BLOCKS)
+        size = next(blocks)
+        if (
+            not len(found[-1]) and self.restarts
+        ):  # a few starts cost less than to ask whether more are in vain
+            n, size = min(size, self.restarts), next(blocks)
+            found.append(self._attempt(self._random(n), first=True))
         if not len(found[-1]):
             if self.hopeless is not None and self.hopeless():
                 self.restarts = min(self.restarts, sum(_BLOCKS[:2]))
             else:
                 found.append(self._raced())
-        blocks = iter(_BLOCKS)
-        size = next(blocks)
         while self.used < self.restarts and not sum(map(len, found)):
             n = min(size, self.restarts - self.used)
             found.append(self._attempt(self._random(n), first=True))
