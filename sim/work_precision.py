@@ -187,7 +187,7 @@ def sweep(
     stalled, total = 0, 0.0
 
     def estimated() -> list[Row]:
-        found = _estimates(runner, motions, apart)
+        found = _estimates(runner, motions, apart) if rows else []
         return [replace(row, estimate=estimate) for row, estimate in zip(rows, found, strict=True)]
 
     try:
