@@ -1,5 +1,6 @@
 """Live goals: followed from the state of the run, on every engine, within limits, the same every time."""
 
+import mujoco
 import numpy as np
 import pytest
 from pantograph.models import load_model
@@ -199,3 +200,55 @@ def test_an_arm_that_begins_straight_follows_a_goal_inwards_along_it(solve):
     goal = {"at": "tip", "times": [0, 1, 2], "position": [[1.8, 0, 2], [1.08, 0, 2], [1.08, 0, 2]]}
     recording = run(Scene(duration=2.0, models=[{"file": "planar_2r"}], goals=[goal | {"solve": solve}]))
     assert recording.missed[0, 0, 0] < 1e-6 and recording.missed[-1, 0, 0] < 1e-5
+
+
+POST = {"name": "post", "shape": "sphere", "size": [0.06], "position": (0.42, 0.0, 0.5), "fixed": True}
+PAST = {
+    "at": "tip",
+    "times": [0, 0.4, 1.6],
+    "position": [[0.4, -0.2, 0.45], [0.4, -0.2, 0.45], [0.4, 0.2, 0.45]],
+    "solve": "live",
+}
+TOOL = ["tool_cup", "tool_bellows", "tool_stem", "flange", "wrist_link"]
+
+
+def _past(**words):
+    start = {"position": {"waist": -0.45, "shoulder": 0.2, "elbow": 0.4}}
+    goals = [PAST | words]
+    return Scene(duration=2.4, models=[{"file": "arm6"}], props=[POST], goals=goals, initial=start)
+
+
+def _nearest(recording):
+    """Least distance of the tool from the post in a recording, by MuJoCo."""
+    model, data, out = recording.model, mujoco.MjData(recording.model), np.inf
+    for q in recording.q:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        for name in TOOL:
+            ends = np.zeros(6)
+            pair = model.geom(name).id, model.geom("post").id
+            out = min(out, mujoco.mj_geomDistance(model, data, *pair, 1.0, ends))
+    return out
+
+
+def test_live_goals_of_a_scene_keep_named_geoms_apart():
+    assert _nearest(run(_past())) < 0
+    pairs = [(name, "post") for name in TOOL]
+    recording = run(_past(apart=pairs, clearance=0.02))
+    assert _nearest(recording) > 0.018
+    assert recording.missed[-1, 0, 0] < 1e-3  # it goes around
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"apart": [("tool_cap", "post")]}, r"goals\[0\]\.apart\[0\].*tool_cap.*tool_cup"),
+        ({"apart": [("tool_cup", "tool_bellows")]}, "on one body"),
+        ({"apart": [("tool_cup", "post")], "solve": "auto"}, "baked.*solve = .live"),
+        ({"apart": [("tool_cup", "post")], "solve": "baked"}, "baked goal keeps no geoms apart"),
+        ({"clearance": 0.1}, "needs pairs of geoms"),
+    ],
+)
+def test_mistakes_of_geoms_to_be_kept_apart_are_told(words, message):
+    with pytest.raises(SceneError, match=message):
+        make_plan(_past(**words))

@@ -85,6 +85,8 @@ class Live:
             velocity=goals.velocity,
             acceleration=goals.acceleration,
             joints=names,
+            apart=goals.apart,
+            clearance=goals.clearance,
         )
         self.follower.v = self.v
         self.follower.compile(self.goals(0.0))

@@ -40,7 +40,8 @@ class Goals:
     """The goals of a scene and who moves for them: items and joint ids, baked and live.
 
     ``choices``: for every item what it is, how it is solved, and why. ``velocity``, ``acceleration`` (nv,):
-    limits of the freedoms that move, infinite without one.
+    limits of the freedoms that move, infinite without one. ``apart``: pairs of geoms that live joints keep
+    ``clearance`` [m] apart.
     """
 
     baked: tuple[Part, ...] = ()
@@ -49,6 +50,8 @@ class Goals:
     choices: tuple[tuple[str, str, str], ...] = ()
     velocity: Array = field(default_factory=lambda: np.zeros(0))
     acceleration: Array = field(default_factory=lambda: np.zeros(0))
+    apart: tuple[tuple[str, str], ...] = ()
+    clearance: float = 0.0
 
 
 def assign(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[Goals, list[Mistake]]:
@@ -64,7 +67,7 @@ def assign(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[Goals, l
             message = f"no joint without keys moves {'for it' if at is None else repr(at)}"
             mistakes.append(Mistake(("goals", part.place, *(() if at is None else ("at",))), message))
     reasons = _live(model, parts)
-    mistakes += _must_be_baked(parts, reasons) + _blended(model, parts)
+    mistakes += _must_be_baked(parts, reasons) + _blended(model, parts) + _kept_apart(parts, reasons)
     live = [part for part in parts if part.place in reasons]
     choices = tuple(
         (
@@ -81,6 +84,8 @@ def assign(scene: Scene, model: mujoco.MjModel, found: Curves) -> tuple[Goals, l
         choices=choices,
         velocity=_limits(model, parts, reasons, "velocity"),
         acceleration=_limits(model, parts, reasons, "acceleration"),
+        apart=tuple(dict.fromkeys(pair for part in live for pair in part.wanted.item.apart)),
+        clearance=max((p.wanted.item.clearance for p in live if p.wanted.item.apart), default=0.0),
     )
     return goals, mistakes
 
@@ -165,6 +170,21 @@ def _must_be_baked(parts: Sequence[Part], reasons: Mapping[int, str]) -> list[Mi
         elif item.solve == "baked":
             message = f'this goal cannot be baked: {why}; solve = "live" follows as it runs'
             out.append(Mistake(("goals", part.place, "solve"), message))
+    return out
+
+
+def _kept_apart(parts: Sequence[Part], reasons: Mapping[int, str]) -> list[Mistake]:
+    """Mistakes of items that keep geoms apart but are baked, and of different clearances."""
+    out, keeping = list[Mistake](), [part for part in parts if part.wanted.item.apart]
+    sizes = sorted({part.wanted.item.clearance for part in keeping})
+    for part in keeping:
+        if part.place not in reasons:
+            message = 'this goal is baked, which keeps no geoms apart: give it solve = "live"'
+            out.append(Mistake(("goals", part.place, "apart"), message))
+        elif len(sizes) > 1:
+            listing = ", ".join(f"{x:g}" for x in sizes)
+            message = f"all live goals are followed at once: give them one clearance, not {listing} m"
+            out.append(Mistake(("goals", part.place, "clearance"), message))
     return out
 
 

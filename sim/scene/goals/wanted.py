@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ....models import name_of
+from ....models import lookup, name_of
 from ... import rotations
 from ...curves import Curve, keyed
 from ...errors import PantographError
@@ -213,6 +213,15 @@ def _names(item: GoalItem, i: int, model: mujoco.MjModel, kinematics: Kinematics
             mistakes.append(Mistake(("goals", i, "joints", k), joints.missing(pattern)))
     if item.joint is not None and item.joint not in joints.ids:
         mistakes.append(Mistake(("goals", i, "joint"), joints.missing(item.joint)))
+    for k, pair in enumerate(item.apart):
+        try:
+            one, other = (lookup(model, "geom", name) for name in pair)
+        except PantographError as e:
+            mistakes.append(Mistake(("goals", i, "apart", k), str(e)))
+            continue
+        if model.geom_bodyid[one] == model.geom_bodyid[other]:
+            message = f"geoms {pair[0]!r} and {pair[1]!r} are on one body: they never part"
+            mistakes.append(Mistake(("goals", i, "apart", k), message))
     for name in item.posture or {}:
         if name not in joints.ids:
             mistakes.append(Mistake(("goals", i, "posture", name), joints.missing(name)))

@@ -36,7 +36,10 @@ KINDS = {
     "lock": _Words(("at", "stances"), (), ("lead",)),
 }
 _ROWS = ("position", "rotation", "look_at", "point", "distance", "target", "value", "pole", "weight", "blend")
-_EVERY = ("kind", "name", "solve", "velocity", "acceleration", "weight", "blend", "tolerance", "joints")
+_EVERY = (
+    "kind", "name", "solve", "velocity", "acceleration", "apart", "clearance", "weight", "blend", "tolerance",
+    "joints",
+)  # fmt: skip
 _TIMED = ("times", "curve", "ease", "before", "after")
 
 
@@ -91,6 +94,10 @@ class GoalItem(Timed):
     acceleration: Positive | None = Field(
         None, description="likewise, per second squared; live default: 3 turns, 10 m"
     )
+    apart: list[tuple[str, str]] = Field(
+        default_factory=list, description="live: pairs of geoms that its joints keep apart"
+    )
+    clearance: Positive = Field(0.01, description="live: metres between the geoms of `apart`")
     weight: Positive | list[NotNegative] | None = Field(
         None, description="a wish of this weight, also over time; without it, a hard goal"
     )
@@ -142,13 +149,18 @@ class GoalItem(Timed):
             message = f"{len(self.joints)} joints but {len(self.shares)} shares; give one share a joint"
             raise at("shares", message=message)
         if self.kind == "lock":
-            for word in ("weight", "blend", "tolerance", "velocity", "acceleration"):
-                if getattr(self, word) is not None:
+            for word in ("weight", "blend", "tolerance", "velocity", "acceleration", "apart"):
+                if word in self._given():
                     raise at(word, message=f"a lock holds to a tenth of a millimetre: it has no {word!r}")
             if self.solve == "live":
                 raise at("solve", message="a lock must know the motion to come: it is baked, never live")
         if self.blend is not None and self.solve == "live":
             raise at("blend", message="a goal is blended with keys before the run: it cannot be live")
+        if self.apart and self.solve == "baked":
+            message = 'a baked goal keeps no geoms apart: give it solve = "live"'
+            raise at("apart", message=message)
+        if "clearance" in self.model_fields_set and not self.apart:
+            raise at("clearance", message="a clearance needs pairs of geoms: give 'apart' with it")
         for word in ("velocity", "acceleration"):
             if self.blend is not None and getattr(self, word) is not None:
                 raise at(word, message=f"a goal that is blended with keys cannot keep a limit of {word}")
