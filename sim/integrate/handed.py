@@ -161,7 +161,8 @@ def _followed(
         kept = int(np.searchsorted(times, path.reached, "right"))
     messages = {
         Status.FINISHED: f"reached t = {t1:.9g} s",
-        Status.TOO_MANY_STEPS: f"{max_steps} steps reached only t = {path.reached:.9g} s",
+        Status.TOO_MANY_STEPS: f"{max_steps} steps, {path.rejected} of them done again, reached only "
+        f"t = {path.reached:.9g} s",
         Status.STEP_TOO_SMALL: f"at t = {path.reached:.9g} s the tolerance asks for steps below the "
         "resolution of time: a singularity, a discontinuity or a tolerance that doubles cannot meet",
         Status.DIVERGED: f"y or f is not finite after t = {path.reached:.9g} s",

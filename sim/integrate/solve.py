@@ -58,7 +58,7 @@ def solve(
         dense: keep the continuous solution as `Solution.interpolant`.
         error: estimate the global error: by extrapolation from half the step (Hairer, Norsett & Wanner I,
             II.4) or from a hundredth of the tolerances; its cost is in `Solution.error_stats`.
-        max_steps: give up after so many.
+        max_steps: give up after so many; compiled loops count those that are done again, too.
 
     Raises:
         EngineError: contradictory or unusable arguments. A failure underway raises nothing: the solution
