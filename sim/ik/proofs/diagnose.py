@@ -277,7 +277,9 @@ def _conflict(
     proved = gap != NO_GAP
     position, rotation = _sizes(problem, nearest.r)
     names = tuple(g.label for g in goals)
-    reason = f"{' and '.join(names)} exclude each other; at best {_words(position, rotation)} remain"
+    reason = (
+        f"{' and '.join(names)} exclude each other; the best pose found leaves {_words(position, rotation)}"
+    )
     if proved:
         reason += f", {_words(gap.position, gap.rotation)} in sum, proved by {gap.by}"
     else:
