@@ -377,12 +377,10 @@ def test_an_interrupted_report_keeps_what_it_measured(tmp_path, settings):
         result = report(case, tmp_path, engines=("smooth",), budget_s=0.01, progress=told.append)
     assert result.status == "interrupted"
     kept = [r for r in result.rows if r.method == "rk4"]
-    assert [r.setting for r in kept] == [0.1, 0.05][:settings] and np.isfinite(
-        [r.estimate for r in kept]
-    ).all()
-    assert {"euler", "rk4"} <= {r.method for r in result.rows} and "dop853" not in {
-        r.method for r in result.rows
-    }
+    assert [r.setting for r in kept] == [0.1, 0.05][:settings]
+    assert np.isfinite([r.estimate for r in kept]).all()
+    methods = {r.method for r in result.rows}
+    assert "euler" in methods and "dop853" not in methods
     assert any("interrupted during or before smooth rk4" in note for note in result.notes)
     assert json.loads((tmp_path / "report.json").read_text())["status"] == "interrupted"
     assert f"(1 of {len(whole)})" in " ".join(told)
