@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ModelError
 from .collision import Clearance, Gap
-from .goals import Goal
+from .goals import Goal, Rows
 from .numeric.qp import minimise
 from .problem import Problem, freedom_names
 from .saddle import ways_down
@@ -46,6 +46,7 @@ _ITERATIONS = 4  # linearisations a tick
 _CALM = 0.3  # of the greatest velocity, below which a configuration ahead counts as at rest
 _STRIDE = 0.5  # [rad or m] of one of them in search of where to brake, and out of a saddle
 _PUSHED, _EDGE = 1e-6, 1e-6  # share of a residual that a joint feels, and of its room, that count
+_FLAT = 1e-4  # share of |J| |r| below which J'r counts as zero
 _SHORTER = (1.0, 0.1, 0.01)  # of it, that are tried
 _MOST = 1e6  # damping; that of a tick's first linearisation is at most 1
 
@@ -273,7 +274,6 @@ class Follower:
         aim = self.q if last is None else np.where(self.space.coordinates(problem.moved), last, self.q)
         weight = _weights(problem)
         w, damping = problem.weighted(problem.raw(aim[None])), self._aim_damping
-        began = float(np.sum((w.r[0] * weight) ** 2))
         for _ in range(_ITERATIONS):
             r, J = w.r[0] * weight, w.J[0] * weight[:, None]
             cost, slope = float(r @ r), J.T @ r
@@ -288,8 +288,8 @@ class Follower:
             better = float(np.sum((w_trial.r[0] * weight) ** 2)) < cost
             damping = min(max(damping * (0.1 if better else 100.0), _LEAST * _HARD), 1e2 * _HARD)
             aim, w = (trial, w_trial) if better else (aim, w)
-        cost = float(np.sum((w.r[0] * weight) ** 2))
-        if began - cost <= _GAIN * cost and not problem.met(problem.raw(aim[None]).r)[0]:
+        if self._flat(aim, w, weight) and not problem.met(problem.raw(aim[None]).r)[0]:
+            cost = float(np.sum((w.r[0] * weight) ** 2))
             aim, damping = self._aside(problem, aim, cost, damping)
         self._aim_damping = damping
         moved: Array = np.zeros(self.model.nv)
@@ -298,6 +298,13 @@ class Follower:
         steady = np.abs(moved - self._aim_v) <= np.minimum(self.a_max, 1e6) * self.dt * (1 + 1e-9)
         self._aim, self._aim_v = aim, moved
         return self.space.difference(aim[None], self.q[None])[0], moved, np.where(steady, moved, 0.0)
+
+    def _flat(self, q: Array, w: Rows, weight: Array) -> bool:
+        """Whether no freedom changes the rows' cost at q (nq,) to first order, but against its limit."""
+        r, J = w.r[0] * weight, w.J[0] * weight[:, None]
+        slope = J.T @ r
+        inside = self.space.free_directions(q[None], slope[None])[0][0]
+        return bool(np.linalg.norm(slope[inside]) <= _FLAT * np.linalg.norm(J) * np.linalg.norm(r))
 
     def _aside(self, problem: Problem, aim: Array, cost: float, damping: float) -> tuple[Array, float]:
         """A configuration (nq,) that costs less than `aim` along negative curvature, or that, and damping."""
