@@ -340,6 +340,8 @@ def _of_scene(plan: Plan, work: Work) -> Report:
         return _against(case, reference), partial(trajectory_error, case), reference.uncertainty
 
     rows, left, status = work.sweeps(found, measures)
+    order = list(dict.fromkeys(runner.engine for runner in found))
+    rows = tuple(sorted(rows, key=lambda row: order.index(row.engine)))
     sticks = tuple(_yardstick(r, engine) for engine, r in references.items())
     return Report(case.name, rows, sticks, (*notes, *left), status=status)
 
