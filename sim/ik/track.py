@@ -130,8 +130,8 @@ def follow(
     `velocity`, `acceleration`: limits (nv,) or one for all. `start` (nq,): the motion begins exactly there;
     by default at the one of the first goals' solutions, seen from `q0`, that can be continued best.
     `around` (k, nq): motion of the joints that do not move for the goals; default they stay as `q0`. What
-    the goals leave open stays near `around`, `q0` or `start`, and smooth. It keeps no geoms apart, as
-    `Follower` does.
+    the goals leave open stays near `around`, `q0` or `start`, and smooth. Unlike
+    `Follower` it cannot keep geoms apart.
     Raises ModelError for times that are not evenly spaced or goals that do not fit them.
     """
     t = np.asarray(times, dtype=float)
