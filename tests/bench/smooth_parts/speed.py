@@ -66,8 +66,8 @@ TWO_CORES = (
     ("double_pendulum", 60, None),
     ("double_pendulum", 8, None),
 )
-"""Models, steps and bars: much work a state, little beside what is written, and calls that are soon over, which
-show what a call costs beside the work."""
+"""Models, steps and bars: much work a state, little beside what is written, and calls that are soon over,
+which show what a call costs beside the work."""
 
 
 def two_cores(console):
