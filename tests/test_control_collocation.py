@@ -393,7 +393,8 @@ def test_a_limit_for_all_and_one_for_a_joint(tmp_path):
     assert re.search(r"elbow +velocity +1\.5 +1\.6 ", done.output)
 
 
-def app_of_fit(tmp_path, options):
+def fitting(tmp_path):
+    """The command, and a scene of two keyed joints."""
     import typer
     from pantograph.controllers.fit_command import fit as command
 
@@ -405,6 +406,11 @@ def app_of_fit(tmp_path, options):
         '[[keys]]\njoint = "shoulder"\ntimes = [0, 1]\nvalues = [-1.0, 0.5]\n'
         '[[keys]]\njoint = "elbow"\ntimes = [0, 1]\nvalues = [0.5, 1.5]\n'
     )
+    return app, scene
+
+
+def app_of_fit(tmp_path, options):
+    app, scene = fitting(tmp_path)
     return CliRunner().invoke(app, [str(scene), *options], catch_exceptions=False)
 
 
@@ -423,17 +429,7 @@ def test_mistakes_are_told(clip, words, message):
 
 
 def test_the_command_checks_retimes_and_fits(tmp_path):
-    import typer
-    from pantograph.controllers.fit_command import fit as command
-
-    app = typer.Typer()
-    app.command()(command)
-    scene = tmp_path / "swing.toml"
-    scene.write_text(
-        'duration = 1.0\n[[models]]\nfile = "planar_2r"\n'
-        '[[keys]]\njoint = "shoulder"\ntimes = [0, 1]\nvalues = [-1.0, 0.5]\n'
-        '[[keys]]\njoint = "elbow"\ntimes = [0, 1]\nvalues = [0.5, 1.5]\n'
-    )
+    app, scene = fitting(tmp_path)
     run = CliRunner()
     base = [str(scene), "--velocity", "2", "--out", str(tmp_path)]
     done = run.invoke(app, [*base, "--how", "check"])

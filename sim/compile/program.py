@@ -6,6 +6,7 @@ import ctypes
 import json
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from .tape import Tape
 Array = NDArray[np.float64]
 
 
+PIECES = 4  # of a batch for each thread: one that starts late or works slowly takes fewer
 RECENT = 64  # programs kept in memory: loading one and letting it go costs 10 ms
 _recent: dict[tuple[Path | None, str], Code] = {}
 _lock = Lock()
@@ -127,17 +129,31 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def in_parallel(call: Callable[[int, int], None], count: int, lanes: int, threads: int) -> None:
-    """call(first, size) over `count` states, in `threads` blocks of whole lanes side by side."""
+    """call(first, size) over `count` states in pieces of whole lanes, which `threads` take as they come."""
     blocks = -(-count // lanes)
     threads = min(threads, blocks)
     if threads <= 1:
         call(0, count)
         return
-    edges = [min(count, (blocks * k // threads) * lanes) for k in range(threads)] + [count]
-    jobs = [_pool().submit(call, a, b - a) for a, b in pairwise(edges[1:])]
-    call(edges[0], edges[1])
-    for job in jobs:
-        job.result()
+    pieces = min(blocks, PIECES * threads)
+    edges = [min(count, (blocks * k // pieces) * lanes) for k in range(pieces)] + [count]
+    left = deque(pairwise(edges))
+
+    def work() -> None:
+        while True:
+            try:
+                first, end = left.popleft()
+            except IndexError:
+                return
+            call(first, end - first)
+
+    jobs = [_pool().submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        left.clear()
+        for job in jobs:
+            job.result()
 
 
 def address(array: NDArray[Any]) -> int:

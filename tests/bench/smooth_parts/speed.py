@@ -60,14 +60,8 @@ def rollouts(console):
             yield at_least(f"RK4 steps over mujoco.rollout, {name}, {count}", r, bar, "x", detail)
 
 
-TWO_CORES = (
-    ("quadruped", 60, 1.8),
-    ("double_pendulum", 240, 1.8),
-    ("double_pendulum", 60, None),
-    ("double_pendulum", 8, None),
-)
-"""Models, steps and bars: much work a state, little beside what is written, and calls that are soon over,
-which show what a call costs beside the work."""
+TWO_CORES = (("quadruped", 60, 1.8), ("double_pendulum", 60, 1.8), ("double_pendulum", 8, None))
+"""Models, steps and bars: much work a state, little beside what is written, and calls that are soon over."""
 
 
 def two_cores(console):
