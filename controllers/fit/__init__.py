@@ -6,7 +6,7 @@ from .contact import Phase
 from .fitted import Certificate, Fitted
 from .machine import Machine, machine
 from .prove import Proof, prove
-from .retime import Retimed, Stop, retime
+from .timing import Retimed, Stop, retime
 
 __all__ = [
     "Certificate",

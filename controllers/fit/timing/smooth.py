@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip
+from ....sim.clip import Clip
+from ..charts import Charts
+from ..check import by_piece
+from ..machine import Machine
 from .bounded import Timed, fastest, motion
-from .charts import Charts
-from .check import by_piece
 from .grid import Grid
-from .machine import Machine
 from .path import Corner, Measure, corners, even_nodes, measure, path, reversals, stretches
 
 Array = NDArray[np.float64]

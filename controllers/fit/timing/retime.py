@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import dof_names
-from ...sim.clip import Clip, FreeTrack, Motion, Track
-from ...sim.curves import Curve
-from ...sim.errors import PantographError
-from .check import Report, Trace, Violation, by_piece, follow, report
+from ....models import dof_names
+from ....sim.clip import Clip, FreeTrack, Motion, Track
+from ....sim.curves import Curve
+from ....sim.errors import PantographError
+from ..check import Report, Trace, Violation, by_piece, follow, report
+from ..machine import Machine
 from .grid import Grid, even
-from .machine import Machine
 from .path import Corner, uneven
 from .smooth import smooth
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import dof_names
-from ...sim.clip import Clip, Motion
-from ...sim.errors import PantographError
-from .check import rigid
-from .machine import Machine
+from ....models import dof_names
+from ....sim.clip import Clip, Motion
+from ....sim.errors import PantographError
+from ..check import rigid
+from ..machine import Machine
 from .path import TURN, Corner, Path, corner, reversals
 
 Array = NDArray[np.float64]

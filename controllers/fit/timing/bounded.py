@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip, Motion
-from ...sim.errors import PantographError
-from .machine import Machine
+from ....sim.clip import Clip, Motion
+from ....sim.errors import PantographError
+from ..machine import Machine
+from ..watch import interruptible, watch
 from .path import Path
-from .watch import interruptible, watch
 
 Array = NDArray[np.float64]
 Rows = Callable[[Motion, Motion], tuple[Array, Array, Array, Array]]

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ...models import dof_names
-from ...sim.clip import Clip, Motion
-from .check import knots
+from ....models import dof_names
+from ....sim.clip import Clip, Motion
+from ..check import knots
 
 Array = NDArray[np.float64]
 _INSIDE = 1e-5  # of a piece: where the direction of a path that rests at its end is looked at
