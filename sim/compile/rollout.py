@@ -32,7 +32,7 @@ class Method(Protocol):
 class Shape:
     """Sizes of what a compiled integration handles.
 
-    `quaternions` are first entries in x; `nr`, `ng` the sizes of a control law's reference rows and gains
+    `quaternions` are first entries in x; `nr`, `ng`, `nm` the sizes of a control law's rows, gains and memory
     (nr None: the rows are the controls themselves).
     """
 
@@ -45,6 +45,7 @@ class Shape:
     quaternions: tuple[int, ...]
     nr: int | None = None
     ng: int = 0
+    nm: int = 0
 
     @property
     def nx(self) -> int:
@@ -107,19 +108,26 @@ CONTROL_ARGUMENTS = [
     "ptr noalias %g",
     "i64 %g_state",
     "ptr noalias %applied",
+    "ptr noalias %m",
+    "i64 %m_state",
 ]
 
 
 class Control:
-    """Controls of a block: rows of an array, or a compiled law of the state, held over a period."""
+    """Controls of a block: rows of an array, or a compiled law of the state, held over a period.
+
+    A law's memory has one row more than there are periods: the first is what it begins with, each sample
+    writes the next.
+    """
 
     def __init__(self, e: Emitter, shape: Shape, block: Block, U: str):
         self.e, self.shape, self.block, self.U = e, shape, block, U
         self.rows = block.pointers("%r", "%r_state")
         self.R = e.slot(shape.nr or 0)
-        self.G = e.slot(shape.ng)
+        self.G, self.M, self.MN = e.slot(shape.ng), e.slot(shape.nm), e.slot(shape.nm)
         if shape.nr is not None:
             block.gather(block.pointers("%g", "%g_state"), self.G, shape.ng)
+            block.gather(block.pointers("%m", "%m_state"), self.M, shape.nm)
 
     def hold(self, period: str, X: str) -> None:
         """Set the controls of `period` from the state at its start."""
@@ -130,11 +138,20 @@ class Control:
             self.block.gather(rows, self.U, shape.nu)
             return
         self.block.gather(rows, self.R, shape.nr)
-        e.do(f"call void @law({shape.split(e, X)}, ptr {self.R}, ptr {self.G}, ptr {self.U})")
+        e.do(
+            f"call void @law({shape.split(e, X)}, ptr {self.R}, ptr {self.G}, ptr {self.M}, "
+            f"ptr {self.U}, ptr {self.MN})"
+        )
         per_state = e.emit(f"mul nsw i64 %periods, {shape.nu}")
         out = self.block.pointers("%applied", per_state)
         at = e.emit(f"mul nsw i64 {period}, {shape.nu}")
         self.block.scatter(self.U, shifted(e, out, at), shape.nu)
+        if shape.nm:
+            for i in e.over(shape.nm):
+                e.store(e.load(self.MN, i), self.M, i)
+            following = e.emit(f"mul nsw i64 {e.emit(f'add nsw i64 {period}, 1')}, {shape.nm}")
+            kept = shifted(e, self.block.pointers("%m", "%m_state"), following)
+            self.block.scatter(self.M, kept, shape.nm)
 
 
 def fixed_steps(name: str, method: Method, shape: Shape, lanes: int) -> str:

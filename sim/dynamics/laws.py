@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -15,8 +16,34 @@ from ..errors import EngineError
 from .layout import Layout
 from .rigid import spatial
 from .rigid.tree import BALL, FREE
+from .tangent import difference
 
 Array = NDArray[np.float64]
+
+
+class LawSizes(NamedTuple):
+    """Sizes of a compiled law's rows, one a period, its gains, and its memory."""
+
+    row: int
+    gains: int
+    memory: int
+
+
+class CompiledLaw(Protocol):
+    """A law that compiled integrations sample; what its key says is all that its program depends on."""
+
+    @property
+    def key(self) -> str:
+        """What the program is, for the compiled code's key."""
+        ...
+
+    def sizes(self, layout: Layout) -> LawSizes:
+        """Sizes of the arguments r, g, m."""
+        ...
+
+    def tape(self, layout: Layout) -> Tape:
+        """The program (q, v, act, r, g, m) -> u, and the new m."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,6 +60,15 @@ class LinearFeedback:
     q_ref: ArrayLike | None = None
     v_ref: ArrayLike | None = None
     u_ref: ArrayLike | None = None
+
+    @property
+    def key(self) -> str:
+        """Where gains are: the gains themselves are an argument."""
+        return self.pattern().tobytes().hex()
+
+    def sizes(self, layout: Layout) -> LawSizes:
+        """See `CompiledLaw`."""
+        return LawSizes(layout.nq + layout.nv + layout.nu, int(self.pattern().sum()), 0)
 
     def pattern(self) -> NDArray[np.bool_]:
         """Where gains are."""
@@ -68,15 +104,15 @@ class LinearFeedback:
         )
 
     def tape(self, layout: Layout) -> Tape:
-        """The law as a program (q, v, act, r, g) -> u."""
+        """See `CompiledLaw`."""
         mask = self.pattern()
         if mask.shape != (layout.nu, 2 * layout.nv):
             raise EngineError(f"K has shape {mask.shape}; expected ({layout.nu}, {2 * layout.nv})")
         graph, sizes = Graph(), {"q": layout.nq, "v": layout.nv, "act": layout.na}
-        sizes |= {"r": layout.nq + layout.nv + layout.nu, "g": int(mask.sum())}
+        sizes |= dict(zip("rgm", self.sizes(layout), strict=True))
         nodes = {name: graph.inputs(name, size) for name, size in sizes.items()}
         r = nodes["r"]
-        error = _difference(layout, r[: layout.nq], nodes["q"])
+        error = difference(layout.blocks, nodes["q"], r[: layout.nq])
         error += spatial.sub(r[layout.nq : layout.nq + layout.nv], nodes["v"])
         gains, out = iter(nodes["g"]), []
         for row, feedforward in zip(mask, r[layout.nq + layout.nv :], strict=True):
@@ -84,23 +120,7 @@ class LinearFeedback:
             for j in np.flatnonzero(row):
                 total = total + next(gains) * error[j]
             out.append(total)
-        return Tape.build(sizes, {"u": out})
-
-
-def _difference(layout: Layout, to: Sequence[Scalar], start: Sequence[Scalar]) -> list[Scalar]:
-    """Tangent from q = `start` to `to`, as mj_differentiatePos over one second."""
-    out: list[Scalar] = []
-    for kind, at, _ in layout.blocks:
-        if kind in (FREE, BALL):
-            if kind == FREE:
-                out += spatial.sub(to[at : at + 3], start[at : at + 3])
-                at += 3
-            w, x, y, z = start[at : at + 4]
-            turn = spatial.quaternion_product([w, -x, -y, -z], to[at : at + 4])
-            out += spatial.rotation_vector(turn)
-        else:
-            out.append(to[at] - start[at])
-    return out
+        return Tape.build(sizes, {"u": out, "m": []})
 
 
 def joint_pd(model: mujoco.MjModel, kp: ArrayLike, kd: ArrayLike) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import mujoco
 
@@ -31,7 +32,8 @@ class Equations:
 
     `layout` says which joints are state and which are prescribed, `parameters` are model entries that become
     inputs, `friction_width` is the speed [rad/s or m/s] below which dry friction is smoothed (None leaves dry
-    friction out). Raises EngineError naming everything in the model that is not supported.
+    friction out). `given` are expressions of another `graph` in place of the arguments q, v, ...; those that
+    are missing are zero. Raises EngineError naming everything in the model that is not supported.
 
     Vectors over freedoms are in the model's convention (linear parts of free joints in the world frame)
     unless a name says `local` (in the link's frame).
@@ -44,6 +46,8 @@ class Equations:
         *,
         parameters: Sequence[Parameter] = (),
         friction_width: float | None = None,
+        graph: Graph | None = None,
+        given: Mapping[str, Sequence[Scalar]] | None = None,
     ):
         problems = unsupported(model, keyed=layout.keyed)
         if problems:
@@ -51,8 +55,11 @@ class Equations:
         self.model, self.layout, self.friction_width = model, layout, friction_width
         sizes = {"q": layout.nq, "v": layout.nv, "act": layout.na, "u": layout.nu, "tau": layout.nv}
         sizes |= {"a": layout.nv, "w": layout.nw, "p": len(parameters), "bar": max(layout.nx, layout.nv)}
-        self.graph = Graph()
-        self.inputs = {name: self.graph.inputs(name, size) for name, size in sizes.items()}
+        self.graph = graph or Graph()
+        self.inputs: dict[str, Sequence[Any]] = {  # nodes; what is given may be numbers
+            name: self.graph.inputs(name, size) if given is None else given.get(name, [0.0] * size)
+            for name, size in sizes.items()
+        }
         symbols = [parameter_index(model, key) for key in parameters]
         self.fields = Fields(model, dict(zip(symbols, self.inputs["p"], strict=True)))
         self.tree = build_tree(self.fields)

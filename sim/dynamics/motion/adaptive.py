@@ -16,7 +16,7 @@ from ...compile.program import address, in_parallel
 from ...compile.step_control import GUARDED, OK, STATISTICS
 from ...errors import EngineError
 from ...integrate.tableau import Tableau
-from ..laws import LinearFeedback
+from ..laws import CompiledLaw, LinearFeedback
 from ..layout import Layout
 from .guards import Guards
 from .loops import Loop, compiled_loop, finish
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_KINDS = "qqqPPddPdPPPqqPqPPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
+_KINDS = "qqqPPddPdPPPqqPqPPqPqPPqPPPqqPPP"  # of the arguments of `adaptive_steps`
 _NEXT, _TIME = STATISTICS.index("next_step"), STATISTICS.index("time")
 _ONE_SPAN = np.array([[0, 0, 0, -1]])
 JUMP = 1e-9
@@ -37,7 +37,7 @@ JUMP = 1e-9
 
 
 def adaptive_loop(
-    smooth: Smooth, lanes: int, law: LinearFeedback | None, method: Tableau, guards: Guards | None = None
+    smooth: Smooth, lanes: int, law: CompiledLaw | None, method: Tableau, guards: Guards | None = None
 ) -> Loop:
     """The compiled integration to a tolerance."""
     if not method.adaptive:
@@ -201,7 +201,7 @@ def _compiled(
         x0, h0, out, x1, facts, u = (at + 8 * first * stride for at, stride in zip(own, strides, strict=True))
         loop.run(
             size, periods, len(edges), at_edges, at_spans, t0, rtol, at_tolerance, float(max_steps), x0, h0,
-            rows.at(first), rows.per_state, rows.per_row, gains.at(first), gains.per_state, u,
+            rows.at(first), rows.per_state, rows.per_row, gains.at(first), gains.per_state, u, 0, 0,
             parameters.at(first), parameters.per_state, at_knots, at_coefficients, motion.terms, at_jumps, 0,
             at_times, len(t_eval), 0, out, x1, facts,
         )  # fmt: skip
@@ -324,7 +324,7 @@ class Follower:
         motion, at = self.spans.motion, address
         self._loop.run(
             1, 1, len(edges), at(edges), at(of_span), t0, self._rtol, at(self._tolerance), self._max_steps,
-            at(self._x), at(self._h), at(self._u), 0, 0, 0, 0, 0, at(self._parameters.array), 0,
+            at(self._x), at(self._h), at(self._u), 0, 0, 0, 0, 0, 0, 0, at(self._parameters.array), 0,
             at(motion.knots), at(motion.coefficients), motion.terms, at(self.spans.jumps), at(self._offsets),
             at(self._times), last, first, at(self._path), at(self._x1), at(self._stats),
         )  # fmt: skip

@@ -13,7 +13,7 @@ from ...compile.program import address, in_parallel
 from ...compile.rollout import fixed_steps
 from ...errors import EngineError
 from ...integrate.tableau import Tableau
-from ..laws import LinearFeedback
+from ..laws import CompiledLaw, LinearFeedback
 from .loops import PARALLEL_OPERATIONS, Loop, compiled_loop, finish
 from .path import Path
 from .rows import (
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_KINDS = "qqqqdPPqqPqPPqqPqP"  # of the arguments of `fixed_steps`
+_KINDS = "qqqqdPPqqPqPPqPqqPqP"  # of the arguments of `fixed_steps`
 
 
-def fixed_loop(smooth: Smooth, lanes: int, law: LinearFeedback | None, method: Tableau) -> Loop:
+def fixed_loop(smooth: Smooth, lanes: int, law: CompiledLaw | None, method: Tableau) -> Loop:
     """The compiled integration in fixed steps."""
     return compiled_loop(smooth, "fixed", lanes, law, method, fixed_steps, _KINDS)
 
@@ -75,7 +75,7 @@ def fixed(
         loop.run(
             size, periods, hold, every, step, at_start + 8 * first * nx,
             rows.at(first), rows.per_state, rows.per_row, gains.at(first), gains.per_state,
-            at_applied + 8 * first * periods * nu,
+            at_applied + 8 * first * periods * nu, 0, 0,
             table.at(first), table.per_state, table.per_row, parameters.at(first), parameters.per_state,
             at_path + 8 * first * path.shape[1] * nx,
         )  # fmt: skip

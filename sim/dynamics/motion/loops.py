@@ -17,7 +17,7 @@ from ...compile.loops import declare
 from ...compile.program import Code, facts_of, obtain
 from ...compile.rollout import Shape, live_stages
 from ...integrate.tableau import Tableau
-from ..laws import LinearFeedback
+from ..laws import CompiledLaw
 from .guards import Guards
 from .path import STATUS, Path
 from .rows import Start
@@ -74,7 +74,7 @@ def compiled_loop(
     smooth: Smooth,
     name: str,
     lanes: int,
-    law: LinearFeedback | None,
+    law: CompiledLaw | None,
     method: Tableau,
     emit: Callable[..., str],
     kinds: str,
@@ -83,8 +83,8 @@ def compiled_loop(
     **options: Any,
 ) -> Loop:
     """The integration that `emit` writes with `options`, around the model's rate, a law and guards."""
-    pattern = b"" if law is None else law.pattern().tobytes()
-    known = (name, lanes, method, pattern, guards and guards.key)
+    controlled = "" if law is None else law.key
+    known = (name, lanes, method, controlled, guards and guards.key)
     found: Loop | None = smooth.loops.get(known)
     if found is not None:
         return found
@@ -104,7 +104,7 @@ def compiled_loop(
         loops += emit(name, method, shape_of(smooth, law), lanes, **options) + packed(name, kinds)
         return kernels, loops, facts_of(rate) | {"formulation": smooth.formulation}
 
-    key = key_of(smooth.key, name, str(lanes), _method_key(method), pattern, guards.key if guards else "")
+    key = key_of(smooth.key, name, str(lanes), _method_key(method), controlled, guards.key if guards else "")
     code = obtain(f"{name}:{method.name}", lanes, smooth.cache, key, make)
     loop = smooth.loops[known] = Loop(code, name, kinds.replace("P", "q"), method)
     return loop
@@ -118,12 +118,12 @@ def _method_key(method: Tableau) -> str:
     )
 
 
-def shape_of(smooth: Smooth, law: LinearFeedback | None) -> Shape:
+def shape_of(smooth: Smooth, law: CompiledLaw | None) -> Shape:
     """Sizes of a model's integrations."""
     lay = smooth.layout
-    nr, ng = (None, 0) if law is None else (lay.nq + lay.nv + lay.nu, int(law.pattern().sum()))
+    sizes = (None, 0, 0) if law is None else law.sizes(lay)
     size = len(smooth.parameters)
-    return Shape(lay.nq, lay.nv, lay.na, lay.nu, lay.nw, size, tuple(lay.quaternions), nr, ng)
+    return Shape(lay.nq, lay.nv, lay.na, lay.nu, lay.nw, size, tuple(lay.quaternions), *sizes)
 
 
 def finish(

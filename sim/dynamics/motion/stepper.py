@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...compile.program import address
 from ...integrate.tableau import Tableau
+from ..laws import CompiledLaw
 from .fixed import fixed_loop
 
 if TYPE_CHECKING:
@@ -47,6 +48,37 @@ class Stepper:
         at_x, at_u, at_path, at_none, at_p = self._at
         table = at_none if w is None else address(w)
         self._run(
-            1, 1, steps, 1, step, at_x, at_u, 0, 0, at_none, 0, at_none, table, 0, self._nw, at_p, 0, at_path
-        )
+            1, 1, steps, 1, step, at_x, at_u, 0, 0, at_none, 0, at_none, 0, 0, table, 0, self._nw, at_p, 0,
+            at_path,
+        )  # fmt: skip
         return self._path[: steps + 1]
+
+
+class ControlledStepper:
+    """Compiled steps of `method` under a compiled law with `gains` (ng,), sampled within them."""
+
+    def __init__(self, smooth: Smooth, method: Tableau, law: CompiledLaw, gains: Array):
+        self._loop, self._lay = fixed_loop(smooth, 1, law, method), smooth.layout
+        self._gains = np.ascontiguousarray(gains)
+        self._parameters = np.ascontiguousarray(smooth.parameter_values)
+
+    def __call__(
+        self, x: Array, rows: Array, memory: Array, hold: int, step: float, w: Array
+    ) -> tuple[Array, Array, Array]:
+        """States (periods * hold + 1, nx) from `x` (nx,), controls (periods, nu), and what the law remembers,
+        (periods + 1, nm), from `memory` (nm,) on; the law sees a row of `rows` (periods, nr) every `hold`
+        steps of `step` seconds.
+
+        `w` are contiguous prescribed rows (steps * rows, nw).
+        """
+        periods, nm = len(rows), len(memory)
+        start, rows, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (x, rows, w))
+        path = np.empty((periods * hold + 1, self._lay.nx))
+        u, kept = np.empty((periods, self._lay.nu)), np.empty((periods + 1, nm))
+        kept[0] = memory
+        self._loop.run(
+            1, periods, hold, 1, step, address(start), address(rows), 0, rows.shape[1], address(self._gains),
+            0, address(u), address(kept), 0, address(w), 0, self._lay.nw, address(self._parameters), 0,
+            address(path),
+        )  # fmt: skip
+        return path, u, kept

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...compile.graph import Scalar, absolute, atan2, less, sqrt
+from ...compile.graph import Scalar, absolute, atan2, cos, less, sin, sqrt
 
 Vector = list[Scalar]
 Matrix = list[list[Scalar]]
@@ -87,6 +87,12 @@ def quaternion_product(a: Sequence[Scalar], b: Sequence[Scalar]) -> list[Scalar]
 def quaternion_rate(q: Sequence[Scalar], w: Sequence[Scalar]) -> list[Scalar]:
     """Time derivative of a quaternion for the angular velocity `w` in the turned frame: q (0, w) / 2."""
     return quaternion_product(q, [0.0, *scale(0.5, w)])
+
+
+def quaternion(turn: Sequence[Scalar]) -> list[Scalar]:
+    """Unit quaternion (wxyz) of the rotation vector `turn`."""
+    angle = sqrt(dot(turn, turn) + 1e-200)  # never zero: the ratio below stays exact
+    return [cos(0.5 * angle), *scale(sin(0.5 * angle) / angle, turn)]
 
 
 def rotation_vector(q: Sequence[Scalar]) -> Vector:
