@@ -18,6 +18,10 @@ from rich.table import Table
 from ..sim.errors import PantographError
 
 console = Console()
+_UNITS = (
+    "Where a scene's angles are degrees, rad, rad/s and rad/s^2 are degrees for hinges, also in --sweep; "
+    "gains stay as listed."
+)
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked joints.")]
 
 
@@ -34,6 +38,7 @@ def _list_laws(wanted: bool) -> None:
         for word in entry.words:
             words.add_row(*map(escape, word))
         console.print(Padding(words, (0, 0, 1, 4)))
+    console.print(_UNITS, highlight=False, soft_wrap=True)
     raise typer.Exit
 
 

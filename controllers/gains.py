@@ -13,7 +13,7 @@ from ..models import joint_names
 from ..sim.errors import PantographError, unknown
 
 Array = NDArray[np.float64]
-Gain = float | Mapping[str, float]
+Gain = float | Mapping[str, float] | Array
 
 
 def number(what: str, value: object) -> float:
@@ -63,7 +63,8 @@ def per_joint(
     tracked: NDArray[np.bool_] | None = None,
 ) -> Array:
     """One number >= 0 (> 0 without ``zero``) a degree of freedom (nv,), from one for all or one a joint by
-    name; "" stands for all joints, before others are named, which have ``missing`` without it.
+    name, or as it is, (nv,); "" stands for all joints, before others are named, which have ``missing``
+    without it.
 
     Raises PantographError for what is no such number or no mapping of them, and a name that is no joint, or,
     with ``tracked`` (nv,), none of a tracked joint.
@@ -81,7 +82,9 @@ def per_joint(
                 f"{what} of {name!r} has no effect: that joint is not tracked; tracked: {', '.join(able)}"
             )
         of = f"{what} of {name!r}" if name else what
-        out[model.dof_jntid == names[name] if name else slice(None)] = positive(of, value, zero=zero)
+        rows = model.dof_jntid == names[name] if name else slice(None)
+        each = [positive(of, one, zero=zero) for one in np.ravel(np.asarray(value, dtype=object))]
+        out[rows] = each if isinstance(value, np.ndarray) else each[0]
     return out
 
 

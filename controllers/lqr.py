@@ -58,10 +58,10 @@ class LQR:
 
     Cost per second: ``position`` |q - q_d|^2 + ``velocity`` |v - v_d|^2 + ``force`` |u - u_d|^2, weights one
     number or one a joint by name. ``force`` defaults to 1 / f^2 with f what the joint's drive can give, or
-    its weight at ``q0`` where it can give anything. Joints without keys are kept at ``goal`` (joint ->
-    value), or where they start. With ``final`` [s] regulation ends with the scene, where deviations cost as
-    much as so many seconds of them: gains of a finite horizon, also on keys that rest; without, it goes on
-    for ever. The gains are those of forces held over ``period`` [s], and are computed when first used.
+    its weight at ``q0`` where it can give anything. Joints without keys are kept at ``goal`` [rad, m]
+    (joint -> value), or where they start. With ``final`` [s] regulation ends with the scene, where deviations
+    cost as much as so many seconds of them: gains of a finite horizon, also on keys that rest; without, it
+    goes on for ever. The gains are those of forces held over ``period`` [s], computed when first used.
     """
 
     def __init__(

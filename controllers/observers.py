@@ -85,17 +85,15 @@ class Kalman:
         q0: Array,
         keyed: NDArray[np.bool_] | None = None,
         *,
-        noise: Gain | Array = 1e-3,
-        push: Gain | Array = 5.0,
+        noise: Gain = 1e-3,
+        push: Gain = 5.0,
         extended: bool = True,
     ) -> None:
         self.model, self.q0, self.extended = model, q0, extended
         self.keyed = np.zeros(model.nv, dtype=bool) if keyed is None else keyed
         self.free = ~self.keyed
         self.noise, self.push = (
-            (x if isinstance(x, np.ndarray) else per_joint(model, what, x, missing=missing, zero=False))[
-                self.free
-            ]
+            per_joint(model, what, x, missing=missing, zero=False)[self.free]
             for what, x, missing in (
                 ("the Kalman filter's noise", noise, 1e-3),
                 ("the Kalman filter's push", push, 5.0),

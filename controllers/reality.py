@@ -80,7 +80,7 @@ class Loop:
         top_speed: Gain | None = None,
         play: Gain = 0.0,
         friction: Gain = 0.0,
-        stiction: float = 0.02,
+        stiction: Gain = 0.02,
         learned: str = "",
     ) -> None:
         choice("observer", observer, OBSERVERS, "a loop")
@@ -94,7 +94,7 @@ class Loop:
         self.friction = per_joint(model, "friction", friction, tracked=tracked)
         self.lost = self._lost if self.friction.any() else None
         stopped = self.friction * period / felt_inertia(model, q0)
-        self.stiction = np.maximum(positive("stiction", stiction), stopped)
+        self.stiction = np.maximum(per_joint(model, "stiction", stiction, missing=0.02, zero=False), stopped)
         width = per_joint(model, "play", play, tracked=tracked)
         self.play = Play(model, np.where(tracked, width, 0.0), period)
         if learned:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..sim.control import Target
 from .basin import advance
 from .energy_shaping import EnergyShaping
-from .gains import positive, whole
+from .gains import Gain, per_joint, positive, whole
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -63,11 +63,12 @@ class SwingMemory(NamedTuple):
 
 
 class SwingUp:
-    """Brings a machine with one driven joint to its highest equilibrium, or to ``goal`` (joint -> value).
+    """Brings a machine with one driven joint to its highest equilibrium, or to ``goal`` [rad, m] (joint ->
+    value).
 
     ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, every
-    ``every`` [s] until the catch has the machine; zero foresight takes the first set. Slides without range
-    and hinges alike; slides must stay in their range with ``room`` [m] to spare. Hinges count modulo a turn.
+    ``every`` [s] until the catch has the machine; zero foresight takes the first set. Joints
+    that have a range must stay in it with ``room`` [rad, m] to spare. Hinges count modulo a turn.
     Keys of the driven joint play no part. Looking ahead takes far longer than a sample (the control bench
     tells how long): it is planned outside real time. Raises PantographError when the machine has not exactly
     one driven joint, or no such goal.
@@ -84,7 +85,7 @@ class SwingUp:
         foresight: float = 8.0,
         tries: int = 128,
         every: float = 1.0,
-        room: float = 0.05,
+        room: Gain = 0.05,
         seed: int = 1,
     ) -> None:
         tries, seed = whole("tries", tries), whole("seed", seed, least=0)
@@ -93,7 +94,7 @@ class SwingUp:
         self.nominal, self.a, self.tries, self.seed = self.shaping.nominal, self.shaping.a, tries, seed
         self.low, self.high = self.shaping.low, self.shaping.high
         self.foresight, self.every = positive("foresight", foresight, zero=True), positive("every", every)
-        self.room = positive("room", room, zero=True)
+        self.room = per_joint(model, "room", room, missing=0.05)
 
     # ---- the law, on a batch of machines q, v (b, n)
 
@@ -219,7 +220,8 @@ class SwingUp:
         limited = np.flatnonzero(m.jnt_limited)
         low, high = m.jnt_range[limited].T
         at = q[:, m.jnt_qposadr[limited]]
-        return np.asarray(((at > low + self.room) & (at < high - self.room)).all(axis=1))
+        room = self.room[m.jnt_dofadr[limited]]
+        return np.asarray(((at > low + room) & (at < high - room)).all(axis=1))
 
     def begin(self, machines: int) -> SwingMemory:
         """Memory of a batch before its first sample."""

@@ -18,6 +18,7 @@ from ..sim.engines.common import Broken
 from ..sim.engines.interface import Controls, Held, Problem, Role
 from ..sim.errors import PantographError
 from ..sim.plan import Plan
+from ..sim.scene.angles import law_words
 from .gains import force_limits
 from .ilc import Fed, Learned, learn
 from .nominal import difference
@@ -131,7 +132,8 @@ class _Pushed:
 
 
 def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Disturbance) -> Trial:
-    """Run a plan under the law ``law`` with parameters ``words``; the law believes the undisturbed model.
+    """Run a plan under the law ``law`` with parameters ``words`` in the units of its scene; the law believes
+    the undisturbed model.
 
     The law "ilc" first learns on the disturbed machine, without its push. Raises SceneError for a law or
     parameter that does not fit, and PantographError when the scene has nothing to control. A run that breaks
@@ -139,12 +141,13 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     """
     problem, period = plan.problem, plan.period
     assert period is not None
+    words = law_words(plan.setup.scene, problem.model, words)
     begun, learned = time.perf_counter(), None
     true = _disturbed(problem, disturbance)
     if law == ILC:
         learned, made = _learned(plan, true, words, period)
     else:
-        made = make_law(law, problem, dict(words), period)
+        made = make_law(law, problem, words, period)
     q, v, _ = problem.state0
     try:
         made(0.0, q, v, Target(*problem.clip.evaluate(0.0)), made.start())  # builds what the law needs

@@ -12,6 +12,7 @@ import mujoco
 from .control import Law, Sampled
 from .engines.interface import Engine, Problem, Role
 from .errors import PantographError, SceneError, unknown
+from .scene.angles import law_words
 from .scene.schema import Scene
 
 
@@ -51,9 +52,9 @@ def make_law(
 ) -> Law:
     """The law ``name`` for a problem, sampled every ``period`` [s].
 
-    A law takes what it needs of the problem by the names of its positional arguments, ``parameters`` by its
-    keywords; those of :class:`~pantograph.controllers.reality.Loop` put it behind real sensors and drives,
-    whose limits it knows.
+    A law takes what it needs of the problem by the names of its positional arguments, ``parameters``, in SI,
+    by its keywords; those of :class:`~pantograph.controllers.reality.Loop` put it behind real sensors and
+    drives, whose limits it knows.
     ``model`` is what the law believes the machine to be (default: what it is). Raises SceneError for an
     unknown law or parameter, or a bad value.
     """
@@ -96,8 +97,8 @@ def make_controls(scene: Scene, problem: Problem, period: float | None) -> Sampl
     names none); None without a period: nothing is controlled. Raises SceneError as :func:`make_law`."""
     if period is None:
         return None
-    item = scene.controller
-    law = make_law(item.law if item else "pd", problem, item.parameters if item else {}, period)
+    name = scene.controller.law if scene.controller else "pd"
+    law = make_law(name, problem, law_words(scene, problem.model), period)
     return Sampled(law, problem, period)
 
 

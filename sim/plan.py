@@ -17,6 +17,7 @@ from .engines.smooth import methods as smooth_methods
 from .errors import SceneError, unknown
 from .explain import cheaper, left_out, other_physics, solved
 from .needs import Needs
+from .scene.angles import law_words
 from .scene.build import Setup, resolve
 from .scene.mistakes import Mistake, SceneMistakes, report
 from .scene.schema import Scene
@@ -225,7 +226,8 @@ def _law(problem: Problem, scene: Scene) -> list[Mistake]:
     if scene.controller is None:
         return []
     try:
-        make_law(scene.controller.law, problem, scene.controller.parameters, scene.controller.period)
+        words = law_words(scene, problem.model)
+        make_law(scene.controller.law, problem, words, scene.controller.period)
     except SceneError as e:
         return [Mistake(("controller",), str(e))]
     return []

@@ -40,7 +40,7 @@ def test_every_law_and_word_is_listed():
 def test_the_command_lists_laws_without_a_scene():
     result = CliRunner().invoke(app, ["control", "--laws"])
     assert result.exit_code == 0
-    for word in ("computed-torque", "backlash", "horizon", "repeats", "rad/s"):
+    for word in ("computed-torque", "backlash", "horizon", "repeats", "rad/s", "degrees for hinges"):
         assert word in result.output
 
 

@@ -15,6 +15,7 @@ from ...sim.control import Law, Sampled, Target
 from ...sim.engines.interface import Problem, Role
 from ...sim.errors import PantographError
 from ...sim.plan import Plan
+from ...sim.scene.angles import law_words
 from ..nominal import Nominal, moved
 from ..preview import aimed
 from ..reality import LOOP_WORDS
@@ -49,7 +50,8 @@ class _Point(NamedTuple):
 def loop_of(
     plan: Plan, law: str, words: Mapping[str, Any], *, t: float = 0.0, step: float = 1e-6
 ) -> LinearLoop:
-    """The loop of ``law`` at time ``t`` [s], by derivatives of the engine that the plan chose.
+    """The loop of ``law`` with parameters ``words`` in the units of its scene at time ``t`` [s], by
+    derivatives of the engine that the plan chose.
 
     On the smooth engine they are exact, about the keys, with the law's memory as after its first sample;
     joints without keys are at the law's ``goal`` or where they start. On the contact engine they are
@@ -64,7 +66,9 @@ def loop_of(
         raise PantographError("this scene has nothing to control: give joints the role 'tracked'")
     if not 0.0 <= t <= problem.duration:
         raise PantographError(f"time {t:g} s is outside the scene, which lasts {problem.duration:g} s")
-    m, own = problem.model, {word: value for word, value in words.items() if word not in _left(words)}
+    m = problem.model
+    known = law_words(plan.setup.scene, m, words)
+    own = {word: value for word, value in known.items() if word not in _left(words)}
     made = make_law(law, problem, own, period)
     tracked, keyed = problem.dofs(Role.TRACKED), problem.dofs(Role.KEYED)
     if plan.engine.what == "contact":

@@ -57,11 +57,11 @@ class MPC:
     """Linear MPC with the joint forces ``tracked`` (nv,) as inputs and all joints but ``keyed`` as states.
 
     Looks ``horizon`` [s] ahead by the model's exact linearisation along the keys. Weights ``position``,
-    ``velocity``, ``force`` and ``goal`` are LQR's. What drives can give is a hard limit, and so is ``slew``
-    [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed`` [rad/s, m/s] are soft:
-    the square of what is beyond costs ``soft`` times the position's weight. The first ``fine`` moves take one
-    period each, later ones 2, 4, 8, ...; limits are looked at where moves meet. What drives lose
-    towards their ``top_speed`` [rad/s, m/s] is foreseen at the speeds that LQR alone would have.
+    ``velocity``, ``force`` and the ``goal`` [rad, m] are LQR's. What drives can give is a hard limit, and so
+    is ``slew`` [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed``
+    [rad/s, m/s] are soft: the square of what is beyond costs ``soft`` times the position's weight. The first
+    ``fine`` moves take one period each, later ones 2, 4, 8, ...; limits are looked at where moves meet. What
+    drives lose towards their ``top_speed`` [rad/s, m/s] is foreseen at the speeds that LQR alone would have.
     """
 
     def __init__(

@@ -43,11 +43,11 @@ class NMPC:
     """Nonlinear MPC with the joint forces ``tracked`` (nv,) as inputs, within what the drives give.
 
     Looks ``horizon`` [s] ahead in steps of ``step`` [s]; the cost per second is that of LQR: ``position``,
-    ``velocity`` and ``force`` weights on deviations from the keys (``goal`` for joints without: joint ->
-    value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one costs ``soft``
-    times the position weight. Joints ``keyed`` (nv,) are foreseen as they will move. The first sample plans
-    until nothing is left to gain, each later one makes ``iterations`` improvements. What drives lose towards
-    their ``top_speed`` is not foreseen.
+    ``velocity`` and ``force`` weights on deviations from the keys (``goal`` [rad, m] for joints
+    without: joint -> value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one
+    costs ``soft`` times the position weight. Joints ``keyed`` (nv,) are foreseen as they will move. The first
+    sample plans until nothing is left to gain, each later one makes ``iterations`` improvements. What drives
+    lose towards their ``top_speed`` is not foreseen.
     """
 
     def __init__(

@@ -44,7 +44,12 @@ class Roles(Item):
 
 
 class ControllerItem(BaseModel):
-    """The law that pushes tracked joints; words beside these are the law's own parameters."""
+    """The law that pushes tracked joints; words beside these are the law's own parameters, see
+    'pantograph control --laws'.
+
+    Where a scene's angles are degrees, so are positions, speeds and accelerations of hinges in these, but not
+    gains and weights, which are of radians.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -86,7 +91,11 @@ class Scene(Item):
     format: Literal[1] = Field(1, description="version of this format")
     title: str = ""
     duration: Positive = Field(description="seconds")
-    angle: Literal["radian", "degree"] = Field("radian", description="unit of all angles in this scene")
+    angle: Literal["radian", "degree"] = Field(
+        "radian",
+        description="unit of angles in this scene: of hinges, also of their speeds and accelerations, and of "
+        "euler angles; gains, weights and the table 'fit' have radians, cameras degrees",
+    )
     rate: Positive = Field(120.0, description="recorded samples a second, rounded to whole steps")
     models: list[ModelItem] = Field(default_factory=list)
     props: list[PropItem] = Field(default_factory=list)
