@@ -13,9 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sim.clip import Clip
+from ..sim.compile.cache import key_of, source
 from ..sim.control import Target
+from ..sim.dynamics.layout import Layout
+from ..sim.dynamics.rigid import spatial
+from ..sim.dynamics.tangent import difference as difference_of
+from ..sim.dynamics.tangent import moved as moved_of
+from ..sim.formula import Expressed, Formula, Symbols
 from .gains import positive
-from .nominal import Nominal, difference, moved
+from .nominal import Nominal, difference, differences, moved
 from .preview import Preview
 
 Array = NDArray[np.float64]
@@ -72,6 +78,38 @@ class ComputedTorque:
             a[p] = np.linalg.solve(inertia[np.ix_(p, p)], -bias[p])
         tau = self.nominal.inverse(q_mid, v_mid, a)
         return tau if self._all else np.where(self.tracked, tau, 0.0), None
+
+    def formula(self, period: float) -> Formula | None:
+        """See :class:`~pantograph.sim.formula.Formula`; None for a model that expressions do not know."""
+        m, nq, nv = self.model, self.model.nq, self.model.nv
+        blocks = Layout(m).blocks
+        if not self.nominal.compiled:
+            return None
+
+        def rows(first: int, now: Target) -> Array:
+            middle = self.preview.ahead(first, len(now.q))
+            return np.hstack([now.q, now.v, differences(m, now.q, middle.q), middle.v, middle.a])
+
+        def express(q: Symbols, v: Symbols, row: Symbols, gains: Symbols, _: Symbols) -> Expressed:
+            q_d, (v_d, way, v_m, a_m) = row[:nq], (row[nq + k * nv : nq + (k + 1) * nv] for k in range(4))
+            error, rate = difference_of(blocks, q, q_d), spatial.sub(v_d, v)
+            kp, kd, half = gains
+            a = [
+                x + kp * e + kd * r if on else x
+                for x, e, r, on in zip(a_m, error, rate, self.tracked, strict=True)
+            ]
+            way = [half * x if free else w for x, w, free in zip(v, way, self.passive, strict=True)]
+            v_mid = [x + (b - c) for x, b, c in zip(v, v_m, v_d, strict=True)]
+            passive = self.passive if self._any_passive else None
+            return self.nominal.express(moved_of(blocks, q, way), v_mid, a, passive), ()
+
+        return Formula(
+            key=key_of(source(__file__), self.nominal.key, np.array([self.tracked, self.passive]).tobytes()),
+            gains=np.array([self.kp, self.kd, 0.5 * self.period]),
+            width=nq + 4 * nv,
+            rows=rows,
+            express=express,
+        )
 
     def _with_passive(self, q_mid: Array, q: Array, v: Array) -> Array:
         """``q_mid`` with passive joints carried on by their own velocity."""

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models import name_of
+from ..sim.compile.cache import key_of, source
+from ..sim.compile.graph import Scalar, absolute, clip, less, maximum, minimum
 from ..sim.errors import PantographError
 from .gains import Gain, force_limits, limit_per_joint, positive
 
@@ -51,6 +53,21 @@ class Drives:
             return self.low, self.high
         left = np.clip(1.0 - np.abs(v) / self.top, 0.0, 1.0)
         return np.where(v < 0, left * self.low, self.low), np.where(v > 0, left * self.high, self.high)
+
+    @property
+    def key(self) -> str:
+        """Tells `express` of different drives apart."""
+        return key_of(source(__file__), np.array([self.low, self.high, self.top]).tobytes())
+
+    def express(self, dof: int, force: Scalar, v: Scalar) -> Scalar:
+        """``force`` within what `at` gives, for one freedom, as an expression."""
+        low, high = (float(x[dof]) for x in (self.low, self.high))
+        if np.isinf(self.top[dof]):
+            return clip(force, low, high)
+        left = maximum(1.0 - absolute(v) / float(self.top[dof]), 0.0)
+        back = less(v, 0.0)
+        least, most = low * (1.0 - back * (1.0 - left)), high * (left + (1.0 - left) * (1.0 - less(0.0, v)))
+        return minimum(maximum(force, least), most)
 
     def told(self, model: mujoco.MjModel) -> mujoco.MjModel:
         """``model`` with these limits at rest as its joints' own, for laws to know."""

@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 
 from ..models import dof_names
 from ..sim.clip import Clip
+from ..sim.compile.cache import key_of, source
 from ..sim.control import Target
+from ..sim.dynamics.layout import Layout
+from ..sim.dynamics.rigid import spatial
+from ..sim.dynamics.tangent import difference as difference_of
 from ..sim.errors import PantographError
+from ..sim.formula import Expressed, Formula, Symbols
 from .design.linear import held_matrices, linearise_path
 from .design.riccati import Regulator, along, dlqr
 from .gains import Gain, force_weights, per_joint, positive
@@ -149,6 +154,34 @@ class LQR:
         out = np.zeros((len(self.solution.u), self.model.nv))
         out[:, self.tracked] = self.solution.u
         return out
+
+    def formula(self, period: float) -> Formula:
+        """See :class:`~pantograph.sim.formula.Formula`."""
+        m, nq, nv, still = self.model, self.model.nq, self.model.nv, len(self.gains) == 1
+        blocks, entries = Layout(m).blocks, np.nonzero(self.gains.any(axis=0))
+        K = self.gains[:, entries[0], entries[1]]
+
+        def rows(first: int, now: Target) -> Array:
+            ticks = np.arange(first, first + len(now.q))
+            q = np.where(self.unkeyed, self.preview.clip.q0, now.q)
+            needed = self._forces[np.minimum(ticks, len(self._forces) - 1)]
+            known = [q, now.v, needed]
+            return np.hstack(known if still else [*known, K[np.minimum(ticks, len(K) - 1)]])
+
+        def express(q: Symbols, v: Symbols, row: Symbols, gains: Symbols, _: Symbols) -> Expressed:
+            error = difference_of(blocks, q, row[:nq]) + spatial.sub(row[nq : nq + nv], v)
+            tau = list(row[nq + nv : nq + 2 * nv])
+            for i, j, k in zip(*entries, gains if still else row[nq + 2 * nv :], strict=True):
+                tau[i] = tau[i] + k * error[j]
+            return tau, ()
+
+        return Formula(
+            key=key_of(source(__file__), repr((blocks, nv, still)), np.array(entries).tobytes()),
+            gains=K[0] if still else np.zeros(0),
+            width=nq + 2 * nv + (0 if still else K.shape[1]),
+            rows=rows,
+            express=express,
+        )
 
     def start(self) -> None:
         """No memory."""

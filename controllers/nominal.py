@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from functools import cached_property
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.compile.cache import key_of
+from ..sim.compile.graph import Node, Scalar
 from ..sim.compile.program import Bound
+from ..sim.dynamics.fingerprint import code_fingerprint, model_fingerprint
+from ..sim.dynamics.layout import Layout, keyed_joints
 from ..sim.dynamics.smooth import Smooth, compile_model
 from ..sim.dynamics.support import unsupported
 
@@ -80,6 +85,34 @@ class Nominal:
         return self.inverse(q, still, still)
 
     @cached_property
+    def key(self) -> str:
+        """Tells expressions of different models apart."""
+        return key_of(model_fingerprint(self.model), code_fingerprint())
+
+    def express(
+        self,
+        q: Sequence[Scalar],
+        v: Sequence[Scalar],
+        a: Sequence[Scalar],
+        passive: NDArray[np.bool_] | None = None,
+    ) -> list[Scalar]:
+        """`inverse` as an expression of a graph; freedoms ``passive`` (nv,) get no force: they accelerate by
+        themselves, not by ``a``."""
+        from ..sim.dynamics.symbolic import Equations
+
+        free = np.ones(self.model.nv, dtype=bool) if passive is None else passive
+        layout = Layout(self.model, keyed_joints(self.model, ~free))
+        prescribed = [q[i] for i in layout.q_keyed]
+        prescribed += [x[i] for x in (v, a) for i in layout.v_keyed]
+        given = {"q": [q[i] for i in layout.q_free], "v": [v[i] for i in layout.v_free], "w": prescribed}
+        graph = next(x.graph for x in q if isinstance(x, Node))
+        equations = Equations(self.model, layout, graph=graph, given=given)
+        if passive is None:
+            return equations.inverse(a)
+        tau = equations.inverse(equations.acceleration("composite"))
+        return [0.0 if free else x for x, free in zip(tau, passive, strict=True)]
+
+    @cached_property
     def _inverse(self) -> Bound:
         return self.smooth.bind("inverse")
 
@@ -105,6 +138,13 @@ def difference(model: mujoco.MjModel, q: Array, to: Array) -> Array:
     out = np.empty(model.nv)
     mujoco.mj_differentiatePos(model, out, 1.0, q, to)
     return out
+
+
+def differences(model: mujoco.MjModel, q: Array, to: Array) -> Array:
+    """Tangents (n, nv) from configurations ``q`` (n, nq) to ``to`` (n, nq)."""
+    if model.nq == model.nv:
+        return np.asarray(to - q)
+    return np.array([difference(model, a, b) for a, b in zip(q, to, strict=True)])
 
 
 def moved(model: mujoco.MjModel, q: Array, by: Array) -> Array:

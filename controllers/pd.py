@@ -5,12 +5,20 @@ B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), eq. 8.51.
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.compile.cache import key_of, source
 from ..sim.control import Target
+from ..sim.dynamics.layout import Layout
+from ..sim.dynamics.rigid import spatial
+from ..sim.dynamics.tangent import difference
+from ..sim.formula import Expressed, Formula, Symbols
 from .gains import Gain, felt_inertia, per_joint, positive, switch
+from .nominal import Nominal
 
 Array = NDArray[np.float64]
 
@@ -62,6 +70,28 @@ class PD:
             tau = tau + self._weight(q)
         return np.where(self.tracked, tau, 0.0), None
 
+    def formula(self, period: float) -> Formula | None:
+        """See :class:`~pantograph.sim.formula.Formula`; None for a model that expressions do not know."""
+        m, nq, nv = self.model, self.model.nq, self.model.nv
+        blocks, still = Layout(m).blocks, _still(m)
+        if not still.compiled:
+            return None
+
+        def express(q: Symbols, v: Symbols, row: Symbols, gains: Symbols, _: Symbols) -> Expressed:
+            error, kp, kd = difference(blocks, q, row[:nq]), gains[:nv], gains[nv:]
+            tau = [kp[i] * error[i] + kd[i] * (row[nq + i] - v[i]) for i in range(nv)]
+            if self.gravity:
+                tau = spatial.add(tau, still.express(q, [0.0] * nv, [0.0] * nv))
+            return tau, ()
+
+        return Formula(
+            key=key_of(source(__file__), still.key, repr(self.gravity)),
+            gains=np.concatenate([self.kp, self.kd]),
+            width=nq + nv,
+            rows=lambda first, targets: np.hstack([targets.q, targets.v]),
+            express=express,
+        )
+
     def _weight(self, q: Array) -> Array:
         """Joint forces g(q) (nv,) against gravity, less what the model compensates itself."""
         m, d = self.model, self.data
@@ -75,3 +105,11 @@ class PD:
             mujoco.mj_passive(m, d)
             weight -= d.qfrc_gravcomp
         return weight
+
+
+def _still(model: mujoco.MjModel) -> Nominal:
+    """``model`` with nothing passive but gravity and what compensates it."""
+    bare = copy.copy(model)
+    bare.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SPRING)
+    bare.opt.density = bare.opt.viscosity = 0.0
+    return Nominal(bare)

@@ -12,7 +12,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.compile.cache import key_of, source
+from ..sim.compile.graph import Scalar
 from ..sim.control import Target
+from ..sim.dynamics.layout import Layout
+from ..sim.dynamics.tangent import difference as difference_of
+from ..sim.formula import Expressed, Formula, Symbols
 from .drives import Drives
 from .gains import Gain, choice, felt_inertia, per_joint, positive, unit_free_gains
 from .nominal import Nominal, difference
@@ -95,6 +100,50 @@ class PID:
         back = 1.0 - np.exp(-dt / self.windup)
         integral = memory.integral + self.ki * error * dt + (tau - wanted) * back
         return np.where(self.tracked, tau, 0.0), PIDMemory(t, integral, velocity)
+
+    def formula(self, period: float) -> Formula:
+        """See :class:`~pantograph.sim.formula.Formula`."""
+        m, nq, nv, drives = self.model, self.model.nq, self.model.nv, self.drives
+        blocks = Layout(m).blocks
+        fade, back = np.exp(-period / self.lag), 1.0 - np.exp(-period / self.windup)
+        gains = [self.kp, self.kd, self.ki * period, back, np.full(nv, fade)]
+
+        def rows(first: int, now: Target) -> Array:
+            return np.hstack([now.q, now.v, self._forwards(now)])
+
+        def express(q: Symbols, v: Symbols, row: Symbols, gains: Symbols, memory: Symbols) -> Expressed:
+            error, v_d, forward = difference_of(blocks, q, row[:nq]), row[nq : nq + nv], row[nq + nv :]
+            kp, kd, ki, back, fade = (gains[k * nv : (k + 1) * nv] for k in range(5))
+            later, integral, velocity = memory[0], list(memory[1 : 1 + nv]), list(memory[1 + nv :])
+            tau: list[Scalar] = []
+            for i in range(nv):
+                velocity[i] = v[i] + later * fade[i] * (velocity[i] - v[i])
+                wanted = forward[i] + kp[i] * error[i] + integral[i] + kd[i] * (v_d[i] - velocity[i])
+                tau.append(drives.express(i, wanted, v[i]))
+                change = ki[i] * error[i] + (tau[i] - wanted) * back[i]
+                integral[i] = integral[i] + later * change
+            return tau, [1.0, *integral, *velocity]
+
+        def unpack(t: float, memory: Array) -> PIDMemory:
+            return PIDMemory(t if memory[0] else np.nan, memory[1 : 1 + nv], memory[1 + nv :])
+
+        return Formula(
+            key=key_of(source(__file__), repr(blocks), drives.key),
+            gains=np.concatenate(gains),
+            width=nq + 2 * nv,
+            rows=rows,
+            express=express,
+            pack=lambda last: np.concatenate([[not np.isnan(last.t)], last.integral, last.velocity]),
+            unpack=unpack,
+        )
+
+    def _forwards(self, now: Target) -> Array:
+        """Feedforward (n, nv) at n targets."""
+        if self.feedforward != "none" and self.nominal.compiled:
+            full = self.feedforward == "full"
+            v, a = (now.v, now.a) if full else (np.zeros_like(now.v), np.zeros_like(now.a))
+            return self.nominal.smooth.inverse(now.q, v, a)
+        return np.array([self._forward(Target(*row)) for row in zip(*now, strict=True)])
 
     def _forward(self, target: Target) -> Array:
         if self.feedforward == "full":

@@ -51,6 +51,11 @@ class Preview:
             np.where(clip.dofs, ahead.a, now.a),
         )
 
+    def ahead(self, first: int, count: int) -> Target:
+        """The keys ``offset`` periods after ``count`` ticks from ``first`` on, those after the last as it."""
+        ticks = np.minimum(np.arange(first, first + count), len(self.times) - 1)
+        return Target(*(x[ticks] for x in self.targets))
+
     @cached_property
     def _loose(self) -> NDArray[np.intp]:
         """Freedoms without keys."""

@@ -14,6 +14,7 @@ from ..models import name_of
 from .clip import Clip
 from .engines.interface import Array, Drive, Held, Problem, Role
 from .errors import EngineError
+from .formula import Formula
 from .kinds import SCALAR
 
 _CHUNK = 1024  # ticks whose targets are evaluated at once
@@ -34,7 +35,8 @@ class Target(NamedTuple):
 class Law(Protocol):
     """A control law: the same input and memory give the same output, in any order of calls.
 
-    One that also has ``lost(v)`` tells forces (nv,) that act at speeds v (nv,) beside what drives give.
+    One that also has ``lost(v)`` tells forces (nv,) that act at speeds v (nv,) beside what drives give. One
+    that has ``formula(period)`` gives itself as a :class:`~pantograph.sim.formula.Formula`, or None.
     """
 
     def start(self) -> Any:
@@ -88,6 +90,21 @@ class Sampled:
             qfrc += self.lost(v)
         return Held(ctrl, qfrc)
 
+    @cached_property
+    def formula(self) -> Formula | None:
+        """The law as an expression, where it is one and its targets are known beforehand."""
+        make = getattr(self.law, "formula", None)
+        if make is None or self.live is not None or self.lost is not None or not self.actuators.plain:
+            return None
+        found: Formula | None = make(self.period)
+        return found
+
+    def rows(self, first: int, count: int) -> Array:
+        """What the law's formula needs at ``count`` ticks from ``first`` on, (count, width)."""
+        assert self.formula is not None
+        ticks = np.arange(first, first + count)
+        return self.formula.rows(first, Target(*self.clip.evaluate(ticks * self.period)))
+
     def _target(self, k: int) -> Target:
         """Where the keys are at tick ``k``; evaluated some ticks at a time."""
         first = k - k % _CHUNK
@@ -125,6 +142,11 @@ class JointActuators:
             force = force - self.bias[:, 0] - self.bias[:, 1] * length - self.bias[:, 2] * rate
         ctrl = np.divide(force, gain, out=np.zeros_like(force), where=gain != 0.0)
         return np.asarray(np.minimum(np.maximum(ctrl, self.low), self.high))
+
+    @property
+    def plain(self) -> bool:
+        """Whether gains are constant."""
+        return not self.gain[:, 1:].any()
 
     @cached_property
     def _motors(self) -> bool:

@@ -14,6 +14,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 _MAGIC = b"PGSM\x00\x01\r\n"
@@ -41,6 +42,12 @@ def key_of(*parts: bytes | str) -> str:
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "little") + data)
     return digest.hexdigest()[:40]
+
+
+@cache
+def source(file: str) -> str:
+    """Hash of a source file, for code whose programs are kept."""
+    return key_of(Path(file).read_bytes())
 
 
 def pack(entry: Mapping[str, bytes]) -> bytes:

@@ -287,8 +287,9 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
 
 
 def clip(x: Scalar, low: float, high: float) -> Scalar:
-    """`x` limited to [low, high]."""
-    return minimum(maximum(x, low), high)
+    """`x` limited to [low, high], either of which may be infinite."""
+    x = x if math.isinf(low) else maximum(x, low)
+    return x if math.isinf(high) else minimum(x, high)
 
 
 def reachable(outputs: Iterable[Scalar]) -> list[Node]:

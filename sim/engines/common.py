@@ -77,16 +77,50 @@ class Recorded(TypedDict):
     tick_qfrc: Array
 
 
-def recorded(
-    model: mujoco.MjModel, samples: list[tuple[float, State]], ticks: list[tuple[float, Held]]
-) -> Recorded:
+class Ticks:
+    """A controller's samples of a run, added one by one or many at once."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._widths = model.nu, model.nv
+        self._blocks: list[tuple[Array, Array, Array]] = []
+        self._single: list[tuple[float, Held]] = []
+
+    def add(self, t: float, held: Held) -> None:
+        """One sample at time ``t`` [s]."""
+        self._single.append((t, held))
+
+    def extend(self, t: Array, ctrl: Array, qfrc: Array) -> None:
+        """Samples at times t (n,): ctrl (n, nu), qfrc (n, nv)."""
+        self._close()
+        self._blocks.append((t, ctrl, qfrc))
+
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """All times (n,), ctrl (n, nu) and qfrc (n, nv)."""
+        self._close()
+        if len(self._blocks) != 1:
+            nothing = np.zeros(0), *(np.zeros((0, width)) for width in self._widths)
+            t, ctrl, qfrc = (np.concatenate(x) for x in zip(nothing, *self._blocks, strict=True))
+            self._blocks = [(t, ctrl, qfrc)]
+        return self._blocks[0]
+
+    def _close(self) -> None:
+        if self._single:
+            nu, nv = self._widths
+            t = np.array([t for t, _ in self._single])
+            held = [held for _, held in self._single]
+            self._blocks.append((t, rows([x.ctrl for x in held], nu), rows([x.qfrc for x in held], nv)))
+            self._single = []
+
+
+def recorded(model: mujoco.MjModel, samples: list[tuple[float, State]], ticks: Ticks) -> Recorded:
     """The arrays of a Segment from its samples and the controller's ticks."""
+    tick_t, tick_ctrl, tick_qfrc = ticks.arrays()
     return {
         "t": np.array([t for t, _ in samples]),
         "q": rows([s.q for _, s in samples], model.nq),
         "v": rows([s.v for _, s in samples], model.nv),
         "act": rows([s.act for _, s in samples], model.na),
-        "tick_t": np.array([t for t, _ in ticks]),
-        "tick_ctrl": rows([u.ctrl for _, u in ticks], model.nu),
-        "tick_qfrc": rows([u.qfrc for _, u in ticks], model.nv),
+        "tick_t": tick_t,
+        "tick_ctrl": tick_ctrl,
+        "tick_qfrc": tick_qfrc,
     }

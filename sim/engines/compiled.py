@@ -12,8 +12,10 @@ from .limits import Limit, Limits, slack
 from .timed import Timed
 
 if TYPE_CHECKING:
+    from ..dynamics.laws import CompiledLaw
     from ..dynamics.motion.guards import Guards
     from ..dynamics.motion.prescribed import Pieces
+    from ..dynamics.motion.stepper import ControlledStepper
     from ..integrate import Tableau
 
 CHUNK = 512  # steps computed in one call at most, and steps whose prescribed motion is evaluated at once
@@ -51,7 +53,7 @@ class Compiled:
         self.q_keyed, self.v_keyed = np.array(lay.q_keyed, dtype=int), np.array(lay.v_keyed, dtype=int)
         self.u_held = np.array(lay.u_held, dtype=int)
         self.whole = not (len(self.q_keyed) or len(self.v_keyed))
-        self.stepper = Stepper(self.smooth, method, CHUNK)
+        self.method, self.stepper = method, Stepper(self.smooth, method, CHUNK)
         self.nodes = np.asarray(method.c)
         self.timed_q = np.isin(self.q_keyed, timed.qpos)
         self.timed_v = np.isin(self.v_keyed, timed.keyed)
@@ -69,8 +71,21 @@ class Compiled:
         return q, v, x[self.nq + self.nv :].copy()
 
     def held(self, held: Held) -> Array:
-        """Held controls and joint forces as the compiled model takes them."""
-        return np.concatenate([held.ctrl[self.u_held], held.qfrc[self.v_free]])
+        """Held controls and joint forces, of one time or of many, as the compiled model takes them."""
+        return np.concatenate([held.ctrl[..., self.u_held], held.qfrc[..., self.v_free]], axis=-1)
+
+    def controlled(self, law: CompiledLaw, gains: Array) -> ControlledStepper:
+        """Steps in which ``law`` with ``gains`` is sampled."""
+        from ..dynamics.motion.stepper import ControlledStepper
+
+        return ControlledStepper(self.smooth, self.method, law, gains)
+
+    def whole_held(self, u: Array) -> Held:
+        """The whole model's controls and joint forces (n, ...) of rows that the compiled model takes."""
+        m, own = self.smooth.model, len(self.u_held)
+        ctrl, qfrc = np.zeros((len(u), m.nu)), np.zeros((len(u), m.nv))
+        ctrl[:, self.u_held], qfrc[:, self.v_free] = u[:, :own], u[:, own:]
+        return Held(ctrl, qfrc)
 
     def motion(self, w: Array) -> tuple[Array, Array]:
         """Positions and velocities of the prescribed joints in rows ``w``."""

@@ -12,7 +12,7 @@ import numpy as np
 from ...models import captured_warnings
 from ..errors import EngineError
 from ..kinds import BALL, FREE
-from .common import Broken, fastest_joint, joint_of_largest, place_of, recorded, steps_per_tick
+from .common import Broken, Ticks, fastest_joint, joint_of_largest, place_of, recorded, steps_per_tick
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
@@ -84,7 +84,7 @@ class _Run:
         self.k = 0  # the step to come
         self.torn: tuple[int, State] | None = None  # a step that has begun, and the state before it
         self.samples: list[tuple[float, State]] = []
-        self.ticks: list[tuple[float, Held]] = []
+        self.ticks = Ticks(self.model)
 
     def segment(self, progress: Callable[[float], None] | None) -> Segment:
         started, status, message, failure = time.perf_counter(), "done", "", None
@@ -149,7 +149,7 @@ class _Run:
             self.samples.append((t, State(d.qpos.copy(), d.qvel.copy(), d.act.copy())))
         if self.controls and self.per_tick and k % self.per_tick == 0 and k < self.steps:
             self.held = self.controls.sample(k // self.per_tick, t, d.qpos.copy(), d.qvel.copy())
-            self.ticks.append((t, self.held))
+            self.ticks.add(t, self.held)
 
     def _advance(self, n: int) -> None:
         step = self._plain

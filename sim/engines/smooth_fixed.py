@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from ..errors import EngineError
-from .common import steps_per_tick
+from .common import HUGE, steps_per_tick
 from .compiled import CHUNK
-from .interface import Array, Controls, Problem
+from .interface import Array, Controls, Held, Problem
 from .smooth_run import MOST, Run
+from .tick import Tick, tick_of
 
 if TYPE_CHECKING:
+    from ..dynamics.motion.stepper import ControlledStepper
     from ..integrate import Tableau
 
 
@@ -31,6 +34,7 @@ class FixedRun(Run):
         self.per_tick = steps_per_tick(controls, self.h)
         self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
         self.most = CHUNK  # steps at once: few after an event, which another may follow
+        self.by_hand = 0  # step before which Python samples the controller
 
     def advance(self, progress: Callable[[float], None] | None) -> str:
         """See `Run`."""
@@ -43,21 +47,68 @@ class FixedRun(Run):
             if k == self.steps:
                 self.keep(self.offset, self.q, self.v, self.act)
                 return ""
-            if self.per_tick and k % self.per_tick == 0:
-                self.sample(k // self.per_tick)
-            if k in self.jumps:
-                self._jump(k)
-            self.release()
-            k = self._chunk(k, self._until_next(k))
+            k = self._ticks(k, self._periods(k)) or self._held(k)
             if progress:
                 progress(self.t0 + k * self.h)
 
+    def _held(self, k: int) -> int:
+        """From step ``k`` on under what is held from there; the step reached."""
+        if self.per_tick and k % self.per_tick == 0:
+            self.sample(k // self.per_tick)
+        if k in self.jumps:
+            self._jump(k)
+        self.release()
+        return self._go(k, *self._roll(k, self._until_next(k)))
+
     def _until_next(self, k: int) -> int:
-        stops = [self.steps - k, self.most]
-        if self.per_tick:
-            stops.append(self.per_tick - k % self.per_tick)
-        stops += [at - k for at in self.jumps if at > k]
-        return min(stops)
+        ahead = self._ahead(k)
+        return min(ahead, self.per_tick - k % self.per_tick) if self.per_tick else ahead
+
+    def _ahead(self, k: int) -> int:
+        """Steps from ``k`` on that may be taken at once, a controller's ticks aside."""
+        return min(self.steps - k, self.most, *(at - k for at in self.jumps if at > k))
+
+    def _periods(self, k: int) -> int:
+        """Control periods from step ``k`` on that machine code can take at once, ticks included."""
+        if self.tick is None or k % self.per_tick or k < self.by_hand or self.resting or k in self.jumps:
+            return 0
+        return self._ahead(k) // self.per_tick
+
+    def _ticks(self, k: int, periods: int) -> int:
+        """Go on for ``periods`` from step ``k``, or less far up to an event; the step reached, 0 for none."""
+        if not periods or self.tick is None:
+            return 0
+        c, rows, n = self.model(), self.model().stepper.rows, periods * self.per_tick
+        w = c.on_grid(k, n)
+        seen = self.tick.rows(k // self.per_tick, c.motion(w[:: rows * self.per_tick]))
+        x = c.gather(self.q, self.v, self.act)
+        path, u, memory = self.controlled(x, seen, self.tick.memory, self.per_tick, self.h, w)
+        if not (np.isfinite(seen).all() and np.abs(path).max() < HUGE):  # not even for NaN
+            self.by_hand = k + n  # where it is told what is wrong, and when
+            return 0
+        self.evaluations += n * c.stepper.stages
+        q, v, act = self._spread(k, path, w)
+        last = self._first_doubtful(k, q, v, act)
+        taken = min(periods, last // self.per_tick + 1)
+        times: Array = self.t0 + self.h * (k + self.per_tick * np.arange(float(taken)))
+        held = c.whole_held(u[:taken])
+        self.held = Held(held.ctrl[-1], held.qfrc[-1])
+        self.tick.remember(float(times[-1]), memory[taken])
+        self.ticks.extend(times, *held)
+        return self._go(k, q, v, act, last)
+
+    @cached_property
+    def tick(self) -> Tick | None:
+        """The controller's tick, where it can be compiled."""
+        with self.preparing():
+            return tick_of(self.controls)
+
+    @cached_property
+    def controlled(self) -> ControlledStepper:
+        """Steps with the controller's ticks in them, of joints none of which rests."""
+        assert self.tick is not None
+        with self.preparing():
+            return self.model(()).controlled(self.tick, self.tick.formula.gains)
 
     def _jump(self, k: int) -> None:
         """Velocities that keyed joints take up at once pull the others along: M_pp dv_p = -M_pk dv_k."""
@@ -69,10 +120,11 @@ class FixedRun(Run):
         pulled = M[np.ix_(c.v_free, self.timed.keyed)] @ self.jumps[k]
         self.v[c.v_free] -= np.linalg.solve(M[np.ix_(c.v_free, c.v_free)], pulled)
 
-    def _chunk(self, k: int, n: int) -> int:
-        """Integrate ``n`` steps from step ``k``, or fewer up to an event at a limit; the step reached."""
-        q, v, act = self._roll(k, n)
-        last = self._first_doubtful(k, q, v, act)
+    def _go(self, k: int, q: Array, v: Array, act: Array, last: int | None = None) -> int:
+        """Take over states (n + 1, ...) from step ``k`` on, up to the ``last`` before an event at a limit, if
+        there is one, and that event's step; the step reached."""
+        n = len(q) - 1
+        last = self._first_doubtful(k, q, v, act) if last is None else last
         for i in range(last):
             if (k + i) % self.problem.sample_every == 0:
                 self.keep((k + i) * self.h, q[i], v[i], act[i])
@@ -98,19 +150,24 @@ class FixedRun(Run):
 
     def _roll(self, k: int, n: int) -> tuple[Array, Array, Array]:
         """States (n + 1, ...) of steps ``k`` to ``k + n``."""
-        c, m = self.model(), self.problem.model
+        c = self.model()
         w = c.on_grid(k, n)
         path = c.stepper(c.gather(self.q, self.v, self.act), c.held(self.held), n, self.h, w)
         self.evaluations += n * c.stepper.stages
+        return self._spread(k, path.copy(), w)
+
+    def _spread(self, k: int, path: Array, w: Array) -> tuple[Array, Array, Array]:
+        """The whole model's states (n + 1, ...) of the compiled model's from step ``k`` on."""
+        c, m, n = self.model(), self.problem.model, len(path) - 1
+        act = path[:, c.nq + c.nv :]
         if c.whole:
-            path = path.copy()
-            return path[:, : c.nq], path[:, c.nq : c.nq + c.nv], path[:, c.nq + c.nv :]
+            return path[:, : c.nq], path[:, c.nq : c.nq + c.nv], act
         q, v = np.empty((n + 1, m.nq)), np.empty((n + 1, m.nv))
         q[:, c.q_free], v[:, c.v_free] = path[:, : c.nq], path[:, c.nq : c.nq + c.nv]
         if c.q_keyed.size:
             q[:-1, c.q_keyed], v[:-1, c.v_keyed] = c.motion(w[:: c.stepper.rows])
             q[-1:, c.q_keyed], v[-1:, c.v_keyed] = c.motion(c.end(k + n))
-        return q, v, path[:, c.nq + c.nv :].copy()
+        return q, v, act
 
     def _step_with_events(self, k: int) -> None:
         """One step in which joints may meet or leave limits: to each event, the event, and on to the end."""

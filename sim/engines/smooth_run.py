@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...models import name_of
-from .common import HUGE, Broken, fastest_joint, place_of, recorded, rows
+from .common import HUGE, Broken, Ticks, fastest_joint, place_of, recorded, rows
 from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
 from .limits import Limit, complementary, limits_of, rebound, slack
@@ -62,7 +62,7 @@ class Run(ABC):
         self.mark()
         self.samples: list[tuple[float, State]] = []
         self.rests: list[tuple[Limit, ...]] = []
-        self.ticks: list[tuple[float, Held]] = []
+        self.ticks = Ticks(problem.model)
         self.events: list[Event] = []
         self.evaluations = 0
         self.build_s = 0.0
@@ -142,7 +142,7 @@ class Run(ABC):
         """Sample the controller at its tick ``k``."""
         assert self.controls is not None
         self.held = self.controls.sample(k, self.now, self.q.copy(), self.v.copy())
-        self.ticks.append((self.now, self.held))
+        self.ticks.add(self.now, self.held)
 
     def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
         """Record a state; of several at one moment the last, from which the run goes on."""
@@ -332,14 +332,16 @@ class Run(ABC):
         n, m = len(kept), self.problem.model
         a, drive = np.zeros((n, m.nv)), np.zeros((n, m.nv))
         t = np.array([t for t, _ in kept])
-        tick = np.searchsorted([tick for tick, _ in self.ticks], t + 1e-9, side="right") - 1
-        nothing = Held(np.zeros(m.nu), np.zeros(m.nv))
+        ticks, ctrl, qfrc = self.ticks.arrays()
+        tick = np.searchsorted(ticks, t + 1e-9, side="right") - 1
         for resting in dict.fromkeys(self.rests[:n]):
             at = np.array([i for i in range(n) if self.rests[i] == resting])
             c = self.model(resting)
             q, v = (rows([getattr(kept[i][1], x) for i in at], w) for x, w in (("q", m.nq), ("v", m.nv)))
             act = rows([kept[i][1].act for i in at], m.na)
-            u = np.array([c.held(self.ticks[tick[i]][1] if tick[i] >= 0 else nothing) for i in at])
+            u = np.zeros((len(at), c.smooth.layout.nu))
+            under = tick[at] >= 0
+            u[under] = c.held(Held(ctrl[tick[at[under]]], qfrc[tick[at[under]]]))
             w = c.at(t[at] - self.t0)
             state = {"q": q[:, c.q_free], "v": v[:, c.v_free], "act": act, "u": u, "w": w}
             a[np.ix_(at, c.v_free)] = c.smooth.evaluate("forward", **state)["a"]
