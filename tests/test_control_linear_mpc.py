@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from oracles import control_qp
 from pantograph.controllers.basin import advance
 from pantograph.controllers.design import dlqr
+from pantograph.controllers.drives import Drives
 from pantograph.controllers.lqr import LQR
 from pantograph.controllers.predictive.linear import MPC, _moves
 from pantograph.controllers.predictive.quadratic import LeastChange
@@ -218,6 +219,32 @@ def test_forces_change_no_quicker_than_they_may():
     assert np.abs(np.diff(us)).max() <= 120.0 * 0.02 * (1 + 1e-9)
     assert np.abs(np.diff(us)).max() > 120.0 * 0.02 * (1 - 1e-9)
     assert np.abs(us).max() <= 15.0 * (1 + 1e-9)
+
+
+@given(seeds, st.sampled_from([cart, arm]))
+@settings(max_examples=12)
+def test_a_force_leaves_its_slew_only_along_the_limit_of_its_motor(seed, make):
+    """Motors that lose their force at low speeds, faster than it may change; kicks every few ticks."""
+    rng = np.random.default_rng(seed)
+    limit, top, fine = np.exp(rng.uniform(1, 4)), np.exp(rng.uniform(-1.5, 1.5)), int(rng.integers(1, 12))
+    slew = limit * np.exp(rng.uniform(-1, 3))
+    words = {"reach": 0.6, "goal": {"hinge": 0.0}} if make is cart else {}
+    law = make(limit=limit, slew=slew, horizon=rng.choice([0.1, 0.5]), fine=fine, top_speed=top, **words)
+    drives, moved, memory = Drives(law.model, law.lqr.tracked, None, top), law.inputs, law.start()
+    q, v, before = target(law.lqr, 0.0).q + 0.2 * rng.normal(size=2), rng.normal(size=2), None
+    for k in range(40):
+        v = v + rng.normal(size=2) * (rng.uniform() < 0.2)
+        tau, memory = law(0.02 * k, q, v, target(law.lqr, 0.02 * k), memory)
+        (low, high), u, eps = (x[moved] for x in drives.at(v)), tau[moved], 1e-9 * limit
+        assert ((u >= low - eps) & (u <= high + eps)).all()
+        if before is not None:
+            change, most = u - before, slew * 0.02 + eps
+            assert ((change >= -most) | (np.abs(u - high) < eps)).all()
+            assert ((change <= most) | (np.abs(u - low) < eps)).all()
+        before = u
+        q, v = (x[0] for x in advance(law.lqr.nominal, q[None], v[None], tau[None], 0.005, 4))
+        if np.abs(v).max() > 50.0:  # a machine that its motor cannot hold
+            break
 
 
 def balancing(**goal):

@@ -24,6 +24,7 @@ from .quadratic import NOTHING, LeastChange, Rows
 
 Array = NDArray[np.float64]
 _REPEATS = 4  # moves of each length beyond the fine ones
+_ANY = 1e300  # in place of infinite forces, whose difference is nothing
 
 
 class Doubling(NamedTuple):
@@ -61,7 +62,8 @@ class MPC:
     is ``slew`` [N m/s, N/s], how quickly their forces may change. Ranges of joints and ``speed``
     [rad/s, m/s] are soft: the square of what is beyond costs ``soft`` times the position's weight. The first
     ``fine`` moves take one period each, later ones 2, 4, 8, ...; limits are looked at where moves meet. What
-    drives lose towards their ``top_speed`` [rad/s, m/s] is foreseen at the speeds that LQR alone would have.
+    drives lose towards their ``top_speed`` [rad/s, m/s] is foreseen at the speeds that LQR alone would have;
+    where that is more than ``slew`` allows, forces follow the drives.
     """
 
     def __init__(
@@ -188,22 +190,31 @@ class MPC:
 
     def limits(self, t: float, before: Array | None, able: tuple[Array, Array]) -> tuple[Array, Array]:
         """Least and greatest value of every row: forces, their changes (moves of one period), states."""
-        fine = self.powers.count(0)
-        slew = np.tile(self.slew, fine if before is not None else fine - 1)
+        slower, quicker = self._changes(before, able)
         first = max(round(t / self.lqr.period), 0)
         ends = np.minimum(first + np.cumsum(2 ** np.array(self.powers)), len(self.wanted) - 1)
         wanted = self.wanted[ends]
         return (
-            np.concatenate([able[0].ravel(), -slew, (self.x_low[self.limited] - wanted).ravel()]),
-            np.concatenate([able[1].ravel(), slew, (self.x_high[self.limited] - wanted).ravel()]),
+            np.concatenate([able[0].ravel(), slower.ravel(), (self.x_low[self.limited] - wanted).ravel()]),
+            np.concatenate([able[1].ravel(), quicker.ravel(), (self.x_high[self.limited] - wanted).ravel()]),
         )
+
+    def _changes(self, before: Array | None, able: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Least and greatest change (moves of one period, m) of the forces: ``slew``, or as much more as what
+        drives can give shrinks at speed, so that the force ``before`` (m,), and any other that they could
+        give, has a way on."""
+        low, high = (np.clip(side[: self.powers.count(0)], -_ANY, _ANY) for side in able)
+        if before is not None:
+            low, high = np.vstack([before, low]), np.vstack([before, high])
+        return np.minimum(-self.slew, np.diff(high, axis=0)), np.maximum(self.slew, np.diff(low, axis=0))
 
     def _now(self, before: Array | None, able: tuple[Array, Array]) -> tuple[Array, Array]:
         """Hard limits (m,) of the forces now, for what rounding leaves of them."""
         low, high = able[0][0], able[1][0]
         if before is None:
             return low, high
-        return np.maximum(low, before - self.slew), np.minimum(high, before + self.slew)
+        slower, quicker = self._changes(before, able)
+        return np.maximum(low, before + slower[0]), np.minimum(high, before + quicker[0])
 
     def _rows(self, x: Array, u: Array, before: Array | None) -> Array:
         """Values of the rows that have limits, for states x (b + 1, ...) and forces u (b, ...)."""

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 NOTHING: Rows = np.zeros(0, dtype=np.intp)
 _ROOM = 16  # programs are made for multiples of so many rows
-_EXACT = 1e-10  # what a limit may be crossed by, of the row's size
+_EXACT = 1e-10  # what a limit may be crossed by, of the size of the terms in its row
 
 
 class Daqp:
@@ -83,7 +83,8 @@ class LeastChange:
             at = M @ z + slack
             crossed = np.maximum(at - high, low - at)
             bound = np.where(at > high, high, low)
-            beyond = crossed > _EXACT * (size + np.abs(np.where(np.isfinite(bound), bound, 0.0)))
+            terms = size * np.sqrt(1.0 + z @ z + slack @ (slack / np.where(give > 0.0, give, 1.0)))
+            beyond = crossed > _EXACT * (terms + np.abs(np.where(np.isfinite(bound), bound, 0.0)))
             if beyond[rows].any() and rounds:
                 break
             beyond[rows] = False
