@@ -12,9 +12,8 @@ import numpy as np
 from ..errors import EngineError
 from .common import HUGE, steps_per_tick
 from .compiled import CHUNK
-from .interface import Array, Controls, Held, Problem
+from .interface import Array, Controls, Problem
 from .smooth_run import MOST, Run
-from .tick import Tick, tick_of
 
 if TYPE_CHECKING:
     from ..dynamics.motion.stepper import ControlledStepper
@@ -91,17 +90,8 @@ class FixedRun(Run):
         last = self._first_doubtful(k, q, v, act)
         taken = min(periods, last // self.per_tick + 1)
         times: Array = self.t0 + self.h * (k + self.per_tick * np.arange(float(taken)))
-        held = c.whole_held(u[:taken])
-        self.held = Held(held.ctrl[-1], held.qfrc[-1])
-        self.tick.remember(float(times[-1]), memory[taken])
-        self.ticks.extend(times, *held)
+        self.ticked(c, times, u[:taken], memory[taken])
         return self._go(k, q, v, act, last)
-
-    @cached_property
-    def tick(self) -> Tick | None:
-        """The controller's tick, where it can be compiled."""
-        with self.preparing():
-            return tick_of(self.controls)
 
     @cached_property
     def controlled(self) -> ControlledStepper:

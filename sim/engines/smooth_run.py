@@ -17,6 +17,7 @@ from .compiled import Compiled
 from .interface import Array, Controls, Event, Held, Problem, Segment, State
 from .limits import Limit, complementary, limits_of, rebound, slack
 from .smooth import width_of
+from .tick import Tick, tick_of
 from .timed import Timed
 
 if TYPE_CHECKING:
@@ -143,6 +144,21 @@ class Run(ABC):
         assert self.controls is not None
         self.held = self.controls.sample(k, self.now, self.q.copy(), self.v.copy())
         self.ticks.add(self.now, self.held)
+
+    @cached_property
+    def tick(self) -> Tick | None:
+        """The controller's tick, where it can be compiled."""
+        with self.preparing():
+            return tick_of(self.controls)
+
+    def ticked(self, c: Compiled, times: Array, u: Array, memory: Array) -> None:
+        """Machine code has sampled the controller at ``times`` (n,), gave rows ``u`` (n, ...), and ends with
+        this memory."""
+        assert self.tick is not None
+        ctrl, qfrc = c.whole_held(u)
+        self.held = Held(ctrl[-1], qfrc[-1])
+        self.ticks.extend(times, ctrl, qfrc)
+        self.tick.remember(float(times[-1]), memory)
 
     def keep(self, offset: float, q: Array, v: Array, act: Array) -> None:
         """Record a state; of several at one moment the last, from which the run goes on."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...compile.adaptive import adaptive_steps
 from ...compile.program import address, in_parallel
-from ...compile.step_control import GUARDED, OK, STATISTICS
+from ...compile.step_control import STATISTICS
 from ...errors import EngineError
 from ...integrate.tableau import Tableau
 from ..laws import CompiledLaw, LinearFeedback
 from ..layout import Layout
 from .guards import Guards
 from .loops import Loop, compiled_loop, finish
-from .path import STATUS, Path
+from .path import Path
 from .prescribed import Pieces, constant, ends, pieces_of
 from .rows import NO_MOTION, NOTHING, Controls, Prescribed, PythonLaw, Start, control_rows, parameter_rows
 
@@ -262,76 +261,3 @@ def _called_back(
         smooth, start, shown, path, applied, evaluations, seconds,
         steps=taken, reached=reached, rejected=rejected, status=status,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Reached:
-    """Where a call of `Follower` has come to: x (nx,) at t [s], the next step `h`, records from `first` on,
-    and what it took.
-
-    `guarded`: it stands before a step of length `h` in which a guard may be passed.
-    `failed` says why it went no further, "" if it did not fail.
-    """
-
-    x: Array
-    t: float
-    h: float
-    records: Array
-    first: int
-    evaluations: int
-    steps: int
-    guarded: bool
-    failed: str
-
-
-class Follower:
-    """Compiled steps of one state that follow a tolerance, called again and again; one thread at a time.
-
-    Records are the states at `t_eval`; a call from t0 to t1 makes those in t0 <= t < t1.
-    """
-
-    def __init__(
-        self, smooth: Smooth, method: Tableau, motion: Pieces, t_eval: Array, tolerance: float,
-        guards: Guards | None = None, *, max_steps: int = 10_000_000,
-    ) -> None:  # fmt: skip
-        nx = smooth.layout.nx
-        self.spans, self._loop = Spans(smooth.layout, motion), adaptive_loop(smooth, 1, None, method, guards)
-        self._rtol, self._max_steps, self._times = tolerance, float(max_steps), t_eval
-        self._x, self._u, self._h = np.zeros(nx), np.zeros(max(1, smooth.layout.nu)), np.zeros(1)
-        self._path, self._x1 = np.zeros((len(t_eval), nx)), np.zeros(nx)
-        self._stats, self._tolerance = np.zeros(len(STATISTICS)), np.full(nx, tolerance)
-        self._offsets = np.zeros(guards.count if guards else 0)
-        self._parameters = smooth.own_parameters
-
-    def __call__(
-        self,
-        x: Array,
-        u: Array,
-        t0: float,
-        t1: float,
-        h: float,
-        *,
-        offsets: ArrayLike = (),
-        jump: bool = True,
-    ) -> Reached:
-        """From `x` (nx,) at t0 to t1 or before a guard, under held controls `u` (nu,), first step `h`.
-
-        `offsets` are added to the guards; `jump` tells whether a jump of prescribed velocities at t0 is due.
-        """
-        self._x[:], self._u[: len(u)], self._h[0], self._offsets[:] = x, u, h, offsets
-        edges, of_span = self.spans.between(t0, t1, jump=jump)
-        first, last = np.searchsorted(self._times, (t0, t1)).tolist()
-        motion, at = self.spans.motion, address
-        self._loop.run(
-            1, 1, len(edges), at(edges), at(of_span), t0, self._rtol, at(self._tolerance), self._max_steps,
-            at(self._x), at(self._h), at(self._u), 0, 0, 0, 0, 0, 0, 0, at(self._parameters.array), 0,
-            at(motion.knots), at(motion.coefficients), motion.terms, at(self.spans.jumps), at(self._offsets),
-            at(self._times), last, first, at(self._path), at(self._x1), at(self._stats),
-        )  # fmt: skip
-        steps, _, evaluations, status, following, t = self._stats.tolist()
-        end = int(np.searchsorted(self._times[:last], t, "right" if t < t1 else "left"))
-        failed = "" if status in (OK, GUARDED) else STATUS[int(status)]
-        return Reached(
-            self._x1.copy(), t, following, self._path[first:end].copy(), first, int(evaluations), int(steps),
-            status == GUARDED, failed,
-        )  # fmt: skip

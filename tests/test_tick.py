@@ -1,0 +1,147 @@
+"""A controller's ticks in machine code: the same motion as when Python samples the law, whatever happens."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pantograph.sim.clip import Clip
+from pantograph.sim.compose import make_law
+from pantograph.sim.control import Sampled
+from pantograph.sim.curves import keyed
+from pantograph.sim.engines.interface import Drive, Problem, Role, State
+from pantograph.sim.engines.smooth import SmoothEngine
+from pantograph.sim.engines.tick import tick_of
+
+KINDS = {
+    "hinge": mujoco.mjtJoint.mjJNT_HINGE,
+    "slide": mujoco.mjtJoint.mjJNT_SLIDE,
+    "ball": mujoco.mjtJoint.mjJNT_BALL,
+}
+LAWS = [
+    ("pd", {}),
+    ("pd", {"gravity": False, "damping": 0.5}),
+    ("pid", {}),
+    ("pid", {"feedforward": "full", "frequency": 3.0}),
+    ("pid", {"feedforward": "none", "windup": 0.05}),
+    ("computed-torque", {}),
+    ("lqr", {}),
+    ("lqr", {"final": 0.5}),
+]
+
+
+class Unknown:
+    """A law that is no expression: the one inside it, as Python calls it."""
+
+    def __init__(self, law):
+        self.law = law
+
+    def start(self):
+        return self.law.start()
+
+    def __call__(self, t, q, v, target, memory):
+        return self.law(t, q, v, target, memory)
+
+
+def random_machine(seed, *, joints=("hinge", "slide", "ball", "free"), narrow=False, moving=True):
+    """A random tree with joints of every role, motors and servos on some of the tracked ones."""
+    rng, spec = np.random.default_rng(seed), mujoco.MjSpec()
+    bodies, tracks, roles, driven = [spec.worldbody], {}, [], []
+    for i in range(int(rng.integers(1, 5))):
+        parent = bodies[rng.integers(0, len(bodies))]
+        kind = str(rng.choice(joints)) if parent is not spec.worldbody else str(rng.choice(joints[:-1]))
+        kind = "hinge" if kind == "free" else kind
+        body = parent.add_body(name=f"b{i}", pos=rng.normal(size=3) * 0.3)
+        role = int(rng.choice([Role.TRACKED, Role.TRACKED, Role.KEYED, Role.PASSIVE])) if i else Role.TRACKED
+        role = Role.TRACKED if kind == "ball" and role == Role.KEYED else role
+        scalar = kind != "ball"
+        ranged = {"range": [-0.2, 0.25] if kind == "slide" else [-11.0, 14.0], "limited": True}
+        body.add_joint(
+            name=f"j{i}", type=KINDS[kind], axis=rng.normal(size=3), damping=[0.05, 0, 0],
+            stiffness=[float(rng.choice([0.0, 2.0])), 0, 0], armature=float(rng.choice([0.0, 0.02])),
+            **(ranged if narrow and scalar and role != Role.KEYED else {}),
+        )  # fmt: skip
+        if role != Role.PASSIVE and scalar:
+            kinds = ["clamped", "natural"] if role == Role.TRACKED or not moving else ["clamped", "linear"]
+            values = [[0.0], [0.3 * rng.normal()], [0.1]] if moving else [[0.1]] * 3
+            tracks[f"j{i}"] = keyed([0.0, 0.037, 0.1], values, kind=str(rng.choice(kinds)))
+        if role == Role.TRACKED and scalar and rng.random() < 0.6:
+            act = spec.add_actuator(name=f"a{i}", target=f"j{i}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            act.gear[0] = rng.choice([1.0, -2.5])
+            act.gainprm[0] = 3.0
+            if rng.random() < 0.5:  # a servo, whose bias the controller has to overcome
+                act.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+                act.biasprm[:3] = [0.1, -3.0, -0.2]
+            if rng.random() < 0.6:
+                act.ctrlrange, act.ctrllimited = [-0.8, 0.5], True
+            driven.append(Drive.CONTROLLER)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=0.05 + 0.1 * rng.random(3), contype=0, conaffinity=0
+        )
+        bodies.append(body)
+        roles.append(role)
+    model = spec.compile()
+    q = np.array(model.qpos0)
+    clip = Clip(model, tracks, q)
+    start, v = clip.evaluate(0.0), 0.5 * rng.normal(size=model.nv)
+    q[clip.qpos_mask], v[clip.dofs] = start.q[clip.qpos_mask], start.v[clip.dofs]
+    return Problem(
+        model=model, state0=State(q, v, np.zeros(0)), duration=0.101, roles=np.array(roles, dtype=np.int8),
+        clip=clip, integrator="rk4", step=0.001, sample_every=7, drives=np.array(driven, dtype=np.int8),
+    )  # fmt: skip
+
+
+def both(problem, law, words, *, period=0.003):
+    """Segments with ticks in machine code and with ticks in Python."""
+    made, span = make_law(law, problem, dict(words), period), (0.0, problem.duration)
+    return [SmoothEngine().run(problem, span, Sampled(x, problem, period)) for x in (made, Unknown(made))]
+
+
+def assert_alike(ours, theirs, tolerance=1e-9):
+    assert ours.status == theirs.status == "done"
+    np.testing.assert_array_equal(ours.t, theirs.t)
+    np.testing.assert_array_equal(ours.tick_t, theirs.tick_t)
+    scale = 1 + np.abs(theirs.v).max() ** 2
+    for name in ("q", "v", "tick_ctrl", "tick_qfrc"):
+        force = 1 + np.abs(getattr(theirs, name)).max(initial=0.0)
+        np.testing.assert_allclose(
+            getattr(ours, name), getattr(theirs, name), atol=tolerance * scale * force, err_msg=name
+        )
+
+
+@pytest.mark.parametrize(("law", "words"), LAWS)
+@settings(max_examples=6)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_machine_code_gives_the_forces_of_the_law(law, words, seed):
+    problem = random_machine(seed)
+    assert tick_of(Sampled(make_law(law, problem, dict(words), 0.003), problem, 0.003)) is not None
+    assert_alike(*both(problem, law, words))
+
+
+@pytest.mark.parametrize(("law", "words"), LAWS[2:6:3])
+@settings(max_examples=4)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_steps_that_follow_a_tolerance_sample_alike(law, words, seed):
+    problem = dataclasses.replace(random_machine(seed), tolerance=1e-9, integrator="dopri5")
+    assert_alike(*both(problem, law, words), tolerance=1e-8)
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-10])
+@pytest.mark.parametrize("law", ["pd", "pid"])
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_limits_met_between_ticks_and_the_memory_after_them(law, tolerance, seed):
+    """Narrow limits: runs go on from events under what is held, with the memory of the tick before."""
+    problem = random_machine(seed, joints=("hinge", "slide", "free"), narrow=True)
+    problem = dataclasses.replace(
+        problem, tolerance=tolerance, integrator="dopri5", state0=problem.state0._replace(
+            v=np.where(problem.dofs(Role.KEYED), problem.state0.v, 4.0 * problem.state0.v)
+        )
+    )  # fmt: skip
+    ours, theirs = both(problem, law, {})
+    assert [e.what for e in ours.events] == [e.what for e in theirs.events]
+    assert_alike(ours, theirs, tolerance=1e-7)
