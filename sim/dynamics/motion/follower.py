@@ -96,7 +96,7 @@ class Follower:
         *,
         jump: bool = True,
     ) -> tuple[Reached, Array, Array]:
-        """As a call, but under the law with `gains` (ng,), which sees a row of `rows` (periods, nr) every `hold`
+        """As a call, but under the law with `gains`, which sees a row of `rows` (periods, nr) every `hold`
         seconds; also its controls (periods, nu), and what it remembers (periods + 1, nm), from `memory` on.
         """
         periods = len(rows)
