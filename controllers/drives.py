@@ -51,8 +51,7 @@ class Drives:
         motion, and none beyond its top speed."""
         if not self.slow:
             return self.low, self.high
-        left = np.clip(1.0 - np.abs(v) / self.top, 0.0, 1.0)
-        return np.where(v < 0, left * self.low, self.low), np.where(v > 0, left * self.high, self.high)
+        return at_speed(self.low, self.high, self.top, v)
 
     @property
     def key(self) -> str:
@@ -79,3 +78,15 @@ class Drives:
         known.jnt_actfrclimited[joints] = 1
         known.jnt_actfrcrange[joints] = np.column_stack([self.low, self.high])[changed]
         return known
+
+
+def at_speed(low: Array, high: Array, top: Array, v: Array) -> tuple[Array, Array]:
+    """Least and greatest force of motors at speeds ``v``, by those at rest and their ``top`` speeds."""
+    left = np.clip(1.0 - np.abs(v) / top, 0.0, 1.0)
+    return np.where(v < 0, left * low, low), np.where(v > 0, left * high, high)
+
+
+def by_speed(low: Array, high: Array, top: Array, v: Array) -> tuple[Array, Array]:
+    """Derivatives of :func:`at_speed` by ``v``."""
+    turning = np.abs(v) < top
+    return np.where(turning & (v < 0), low / top, 0.0), np.where(turning & (v > 0), -high / top, 0.0)

@@ -21,37 +21,45 @@ from strategies import seeds
 STILL = Target(np.zeros(2), np.zeros(2), np.zeros(2))
 
 
-def cart(limit=40.0, **words):
+def cart(limit=40.0, top=None, **words):
     model = load_model("cart_pole")
     model.actuator_ctrlrange[0] = [-limit, limit]
     clip = Clip(model, {"slide": keyed([0], [0.0])}, np.zeros(2))
-    return NMPC(model, np.array([True, False]), np.zeros(2), clip, 0.02, np.zeros(2, dtype=bool), **words)
+    return NMPC(
+        model, np.array([True, False]), np.zeros(2), clip, 0.02, np.zeros(2, dtype=bool), top, **words
+    )
 
 
-def arm(**words):
+def arm(top=None, **words):
     model = load_model("planar_2r")
     clip = Clip(model, {n: keyed([0, 1], [0.0, 0.6]) for n in ("shoulder", "elbow")}, model.qpos0)
-    return NMPC(model, np.ones(2, dtype=bool), model.qpos0, clip, 0.02, np.zeros(2, dtype=bool), **words)
+    return NMPC(model, np.ones(2, dtype=bool), model.qpos0, clip, 0.02, np.zeros(2, dtype=bool), top, **words)
 
 
 CART, ARM = cart(8.0, horizon=0.6, step=0.03), arm(horizon=0.4)
-PEERS = {law: formulate(law) for law in (CART, ARM)}
+SLOW = (cart(8.0, 0.6, horizon=0.6, step=0.03), arm({"shoulder": 1.5, "elbow": 0.7}, horizon=0.4))
+PEERS = {law: formulate(law) for law in (CART, ARM, *SLOW)}
 
 
-@pytest.mark.parametrize("law", [CART, ARM])
+@pytest.mark.parametrize("law", PEERS)
 @given(seed=seeds)
-@settings(max_examples=8)
+@settings(max_examples=6)
 def test_the_plan_is_the_optimum_that_ipopt_finds(law, seed):
     rng, nv = np.random.default_rng(seed), 2
     ref = law.horizon(0.107)
     x0 = ref.x[0] + rng.uniform(-0.4, 0.4, 2 * nv)
-    shooting, (low, high) = law.shooting, (law.shooting.weights.low, law.shooting.weights.high)
-    x, u, _, cost = shooting.improve(shooting.begin(x0, np.clip(ref.u, low, high), ref), ref, 200)
+    shooting = law.shooting
+    x, u, _, cost = shooting.improve(shooting.begin(x0, ref.u, ref), ref, 200)
     theirs_u, theirs = PEERS[law](x0, ref, x, u)
-    assert cost <= theirs * (1 + 1e-6) + 1e-9
-    np.testing.assert_allclose(u, theirs_u, atol=2e-3 * (high - low).max())
-    assert (u >= low).all()
-    assert (u <= high).all()
+    # motors' limits bend at rest and at top speed, where steps stall; without their slopes one is off by 300 %
+    assert cost <= theirs * (1 + (0.03 if shooting.slow else 1e-6)) + 1e-9
+    v, c = x[:-1, nv + law.inputs], shooting.weights
+    left = np.clip(1.0 - np.abs(v) / c.top, 0.0, 1.0)
+    low, high = np.where(v < 0, left, 1.0) * c.low, np.where(v > 0, left, 1.0) * c.high
+    if not shooting.slow:
+        np.testing.assert_allclose(u, theirs_u, atol=2e-3 * (c.high - c.low).max())
+    assert (u >= low - 1e-9).all()
+    assert (u <= high + 1e-9).all()
 
 
 @given(seeds)
@@ -81,6 +89,28 @@ def test_derivatives_of_a_step_are_its_differences(seed):
         for j in range(len(base)):
             step = eps * np.eye(len(base))[j]
             np.testing.assert_allclose(matrix[:, j], (f(base + step) - f(base - step)) / (2 * eps), atol=1e-6)
+
+
+@given(seeds)
+def test_the_bounded_minimum_moves_with_its_slope_and_its_bounds(seed):
+    """Differences of d by what moves g and the bounds."""
+    rng, eps = np.random.default_rng(seed), 1e-6
+    m = int(rng.integers(1, 5))
+    M = rng.normal(size=(m, m))
+    H, g, G = M @ M.T + 0.5 * np.eye(m), 3 * rng.normal(size=m), rng.normal(size=(m, 3))
+    low, high = -rng.uniform(0.1, 1, m), rng.uniform(0.1, 1, m)
+    along = rng.normal(size=(m, 3)), rng.normal(size=(m, 3))
+    d, K = bounded_minimum(H, g, G, low, high, along)
+    slope = np.abs(g + H @ d)
+    edge = np.minimum(d - low, high - d)
+    if ((edge < 1e-4) & (slope < 1e-3) | (edge > 1e-12) & (edge < 1e-3)).any():
+        return  # about to leave or to meet a bound
+    for j in range(3):
+        plus, minus = (
+            bounded_minimum(H, g + s * G[:, j], G, low + s * along[0][:, j], high + s * along[1][:, j])[0]
+            for s in (eps, -eps)
+        )
+        np.testing.assert_allclose(K[:, j], (plus - minus) / (2 * eps), atol=1e-5)
 
 
 @given(seeds)

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from pantograph.controllers.drives import at_speed, by_speed
 from pantograph.controllers.nominal import Nominal
 from pantograph.controllers.observers import Kalman
 from pantograph.controllers.predictive.linear import MPC
@@ -136,6 +137,15 @@ def test_predicted_forces_are_those_that_a_motor_can_give_at_speed():
     assert used > 0.999
 
 
+def test_what_motors_lose_at_speed_has_the_slope_of_its_differences():
+    low, high, top = np.array([-3.0]), np.array([2.0]), np.array([1.5])
+    for v in np.linspace(-2.0, 2.0, 12):  # between the bends at 0 and 1.5
+        slopes = by_speed(low, high, top, np.array([v]))
+        ends = [at_speed(low, high, top, np.array([v + s])) for s in (1e-6, -1e-6)]
+        for slope, plus, minus in zip(slopes, *ends, strict=True):
+            assert slope[0] == pytest.approx((plus - minus)[0] / 2e-6, abs=1e-8)
+
+
 @pytest.mark.parametrize("word", ["friction", "play", "top_speed"])
 def test_what_drives_do_at_joints_without_drives_is_refused(word):
     model = load_model("cart_pole")
@@ -175,6 +185,7 @@ def test_predictions_know_what_the_loop_lets_through():
     model = load_model("cart_pole")
     scene = Scene(models=[{"file": "cart_pole"}], duration=1.0, roles={"tracked": ["slide"]})
     problem = make_plan(scene).problem
+    assert make_law("nmpc", problem, {"top_speed": 0.8}, 0.01).law.shooting.weights.top == [0.8]
     for law in ("mpc", "nmpc"):
         made = make_law(law, problem, {"saturation": 0.25}, 0.01).law
         limit = made.high if isinstance(made, MPC) else made.shooting.weights.high

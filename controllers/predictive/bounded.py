@@ -8,15 +8,19 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def bounded_minimum(H: Array, g: Array, G: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """d (m,) that minimises d'H d/2 + g'd within [low, high], and the gains -H^-1 G (m, n) of its free part.
+def bounded_minimum(
+    H: Array, g: Array, G: Array, low: Array, high: Array, along: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """d (m,) that minimises d'H d/2 + g'd within [low, high], and how it moves (m, n) when g changes by
+    G (m, n) and the bounds by ``along`` (m, n each; default: not at all).
 
     Projected Newton steps with their active set (D. Bertsekas, SIAM J. Control Optim. 20, 1982).
     """
     if len(g) == 1:
         one = min(max(-g[0] / H[0, 0], low[0]), high[0])
-        free_one = low[0] < one < high[0]
-        return np.array([one]), np.asarray(-G / H[0, 0] if free_one else np.zeros_like(G))
+        if low[0] < one < high[0]:
+            return np.array([one]), -G / H[0, 0]
+        return np.array([one]), np.zeros_like(G) if along is None else along[0 if one <= low[0] else 1]
     both = np.asarray(np.linalg.solve(H, np.column_stack([g, G])), dtype=np.float64)
     d = -both[:, 0]
     if ((d >= low) & (d <= high)).all():
@@ -40,10 +44,11 @@ def bounded_minimum(H: Array, g: Array, G: Array, low: Array, high: Array) -> tu
         d, value = new, less
         if still:
             break
-    K = np.zeros_like(G)
+    K = np.zeros_like(G) if along is None else np.where((d <= low)[:, None], *along)
     free = _free(d, g + H @ d, low, high)
     if len(free):
-        K[free] = -np.linalg.solve(H[np.ix_(free, free)], G[free])
+        K[free] = 0.0
+        K[free] = -np.linalg.solve(H[np.ix_(free, free)], (G + H @ K)[free])
     return d, K
 
 

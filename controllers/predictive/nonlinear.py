@@ -22,7 +22,8 @@ from ...sim.errors import PantographError
 from ...sim.kinds import FREE, SCALAR
 from ..design.linear import held_matrices, linearise_path
 from ..design.riccati import Regulator
-from ..gains import Gain, force_limits, force_weights, per_joint, positive, whole
+from ..drives import Drives
+from ..gains import Gain, force_weights, per_joint, positive, whole
 from ..lqr import regulator
 from ..nominal import Nominal
 from ..preview import aimed
@@ -47,7 +48,7 @@ class NMPC:
     without: joint -> value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one
     costs ``soft`` times the position weight. Joints ``keyed`` (nv,) are foreseen as they will move. The first
     sample plans until nothing is left to gain, each later one makes ``iterations`` improvements. What drives
-    lose towards their ``top_speed`` is not foreseen.
+    lose towards their ``top_speed`` [rad/s, m/s] is foreseen.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class NMPC:
         clip: Clip,
         period: float,
         keyed: NDArray[np.bool_],
+        top_speed: Gain | None = None,
         *,
         horizon: float = 1.0,
         step: float = 0.02,
@@ -79,6 +81,7 @@ class NMPC:
             per_joint(model, f"the NMPC's {word}", gain)[free]
             for word, gain in (("position", position), ("velocity", velocity))
         ]
+        self.drives = Drives(model, tracked, top_speed=top_speed)
         self.Q = np.concatenate(weights) * self.step
         weight = self.nominal.weight(q0)
         self.R = force_weights(model, tracked, force, weight, "the NMPC's") * self.step
@@ -91,9 +94,9 @@ class NMPC:
         limited = m.jnt_limited[m.dof_jntid].astype(bool) & np.isin(m.jnt_type[m.dof_jntid], SCALAR)
         ranges = m.jnt_range[m.dof_jntid]
         q_low, q_high = np.where(limited, ranges[:, 0], -np.inf), np.where(limited, ranges[:, 1], np.inf)
-        low, high = (limit[self.inputs] for limit in force_limits(m))
+        low, high, top = (x[self.inputs] for x in (self.drives.low, self.drives.high, self.drives.top))
         weights = Weights(
-            self.Q, self.R, self.regulator.P, self.soft, q_low[free], q_high[free], low, high
+            self.Q, self.R, self.regulator.P, self.soft, q_low[free], q_high[free], low, high, top
         )  # fmt: skip
         inputs = np.flatnonzero(self.tracked[free])
         return Shooting(self.nominal.smooth_with(self.keyed), inputs, self.step, weights)
@@ -151,9 +154,8 @@ class NMPC:
         """The last plan as it goes on from the state x (nq + nv,) at ``t`` [s]: its gains keep to it, and
         where it has ended LQR keeps to the references. Without one, the forces that the references need."""
         shooting, old = self.shooting, memory.plan
-        low, high = shooting.weights.low, shooting.weights.high
         if old is None:
-            return shooting.begin(x, np.clip(ref.u, low, high), ref)
+            return shooting.begin(x, ref.u, ref)
         passed = self._step_of(t) - self._step_of(memory.t)
         kept = max(0, self.n - passed)
         X, u, K = ref.x.copy(), ref.u.copy(), np.tile(-self.regulator.K, (self.n, 1, 1))
@@ -163,9 +165,7 @@ class NMPC:
             X[0] = shooting.advance(X[0], u[0], since, np.tile(ref.w[0, 0], (3, 1)))
         path, u = shooting.follow(x, Plan(X, u, K, np.inf), ref)
         cost = shooting.cost(path, u, ref)
-        return (
-            Plan(path, u, K, cost) if np.isfinite(cost) else shooting.begin(x, np.clip(ref.u, low, high), ref)
-        )
+        return Plan(path, u, K, cost) if np.isfinite(cost) else shooting.begin(x, ref.u, ref)
 
 
 def _predictable(model: mujoco.MjModel, held: NDArray[np.bool_]) -> None:

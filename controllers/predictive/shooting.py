@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...sim.compile.program import Bound
 from ...sim.dynamics.smooth import Smooth
+from ..drives import at_speed, by_speed
 from .bounded import bounded_minimum
 from .coordinates import Coordinates
 
@@ -48,7 +49,8 @@ class Plan(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Cost of a step of full length: Q (2 nv,), R (m,), ``final`` (2 nv, 2 nv) at the end, ``soft`` (nv,) on
-    what is beyond q_low, q_high (nv,); and the bounds low, high (m,) of the forces."""
+    what is beyond q_low, q_high (nv,); the bounds low, high (m,) of forces at rest, and the speeds ``top``
+    (m,) at which motors give nothing more, infinite where there is none."""
 
     Q: Array
     R: Array
@@ -58,6 +60,7 @@ class Weights:
     q_high: Array
     low: Array
     high: Array
+    top: Array
 
 
 class Shooting:
@@ -66,6 +69,12 @@ class Shooting:
     def __init__(self, smooth: Smooth, inputs: NDArray[np.intp], step: float, weights: Weights) -> None:
         self.smooth, self.inputs, self.step, self.weights = smooth, inputs, step, weights
         self.coordinates, self.nq, self.nv = Coordinates(smooth.layout), smooth.layout.nq, smooth.layout.nv
+        self.slow = bool(np.isfinite(weights.top).any())
+
+    def able(self, x: Array) -> tuple[Array, Array]:
+        """Least and greatest forces (..., m) at states x (..., nq + nv)."""
+        c = self.weights
+        return at_speed(c.low, c.high, c.top, x[..., self.nq + self.inputs]) if self.slow else (c.low, c.high)
 
     def away(self, x: Array, ref: Array) -> Array:
         """Deviations (..., 2 nv) of states x (..., nq + nv) from ``ref``."""
@@ -76,17 +85,11 @@ class Shooting:
         return np.concatenate([dq, x[..., nq:] - ref[..., nq:]], axis=-1)
 
     def begin(self, x: Array, u: Array, ref: Horizon) -> Plan:
-        """The plan of forces u (n, m) from x (nq + nv,) on, with nothing to keep to it."""
-        path, K = self.rollout(x, u, ref), np.zeros((*u.shape, 2 * self.nv))
+        """The plan of forces u (n, m), as far as the drives give them, from x (nq + nv,) on, with nothing to
+        keep to it."""
+        K = np.zeros((*u.shape, 2 * self.nv))
+        path, u = self.follow(x, Plan(ref.x, u, K, np.inf), ref)
         return Plan(path, u, K, self.cost(path, u, ref))
-
-    def rollout(self, x: Array, u: Array, ref: Horizon) -> Array:
-        """States (n + 1, nq + nv) from x (nq + nv,) under forces (n, m) over the steps of ``ref``."""
-        out = np.empty((len(u) + 1, len(x)))
-        out[0] = x
-        for k in range(len(u)):
-            out[k + 1] = self.advance(out[k], u[k], ref.h[k], ref.w[k])
-        return out
 
     def follow(self, x: Array, plan: Plan, ref: Horizon, change: Array | float = 0.0) -> tuple[Array, Array]:
         """States and forces from x (nq + nv,) on that keep to a plan with ``change`` (n, m) added to its
@@ -95,7 +98,8 @@ class Shooting:
         states[0], wanted = x, plan.u + change
         for k in range(len(forces)):
             raw = wanted[k] + plan.K[k] @ self.away(states[k], plan.x[k])
-            forces[k] = np.minimum(np.maximum(raw, self.weights.low), self.weights.high)
+            low, high = self.able(states[k])
+            forces[k] = np.minimum(np.maximum(raw, low), high)
             states[k + 1] = self.advance(states[k], forces[k], ref.h[k], ref.w[k])
         return states, forces
 
@@ -178,14 +182,15 @@ class Shooting:
         m, expected = u.shape[1], 0.0
         heavy = part[:-1, :, None] * np.diag(c.R) + damping * np.eye(m)
         push = (u - ref.u) * c.R * part[:-1]
-        low, high = c.low - u, c.high - u
+        low, high = (bound - u for bound in self.able(plan.x[:-1]))
+        along = self._along(plan.x[:-1])
         F = np.concatenate([A, B], axis=2)
         diagonal = range(2 * nv)
         for k in range(len(u) - 1, -1, -1):
             f = F[k]
             W, w = f.T @ (Vxx @ f), f.T @ Vx
             Qu, Quu, Qux = push[k] + w[-m:], heavy[k] + W[-m:, -m:], W[-m:, :-m]
-            d, K = bounded_minimum(Quu, Qu, Qux, low[k], high[k])
+            d, K = bounded_minimum(Quu, Qu, Qux, low[k], high[k], along and (along[0][k], along[1][k]))
             Qxx = W[:-m, :-m]
             Qxx[diagonal, diagonal] += curve[k]
             full = Quu @ K + Qux
@@ -194,6 +199,16 @@ class Shooting:
             change[k], gains[k] = d, K
             expected -= float(d @ (2.0 * Qu + Quu @ d))
         return change, gains, expected
+
+    def _along(self, x: Array) -> tuple[Array, Array] | None:
+        """Derivatives (n, m, 2 nv) of the least and greatest forces by states x (n, nq + nv)."""
+        if not self.slow:
+            return None
+        c, (n, m) = self.weights, (len(x), len(self.inputs))
+        out = np.zeros((2, n, m, 2 * self.nv))
+        slopes = by_speed(c.low, c.high, c.top, x[:, self.nq + self.inputs])
+        out[:, :, range(m), self.nv + self.inputs] = slopes
+        return out[0], out[1]
 
     def advance(self, x: Array, u: Array, h: float, w: Array) -> Array:
         """One RK4 step of one state; prescribed motion w (3, nw) as it begins, in its middle, at its end."""

@@ -42,6 +42,12 @@ def formulate(law, ipopt=None):
         )
         cost += c.soft[dof] * ca.sum2(over)
     g = ca.veccat(X[:, 0] - start, X[:, 1:] - step.map(n)(X[:, :-1], U, H))
+    slack = []  # >= 0: what is left of motors' forces at speed
+    for i in np.flatnonzero(np.isfinite(c.top)):
+        v = X[nv + int(law.inputs[i]), :-1] / c.top[i]
+        slack += [c.high[i] * ca.fmax(1 - v, 0) - U[int(i), :], U[int(i), :] - c.low[i] * ca.fmax(1 + v, 0)]
+    spare = np.full(n * len(slack), np.inf)
+    g, most = ca.veccat(g, *slack), np.concatenate([np.zeros(2 * nv * (n + 1)), spare])
     problem = {"x": ca.veccat(X, U), "p": ca.veccat(start, Xr, Ur, H), "f": cost, "g": g}
     plain = {"print_level": 0, "sb": "yes", "tol": 1e-8}
     options = {"print_time": False, "expand": True, "error_on_fail": False, "ipopt": plain | (ipopt or {})}
@@ -53,7 +59,7 @@ def formulate(law, ipopt=None):
     def solve(x0, ref, guess_x, guess_u):
         p = np.concatenate([x0, ref.x.ravel(), ref.u.ravel(), ref.h])
         guess = np.concatenate([guess_x.ravel(), guess_u.ravel()])
-        done = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=0, ubg=0)
+        done = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=0, ubg=most)
         u = np.asarray(done["x"]).ravel()[2 * nv * (n + 1) :].reshape(n, m)
         return u, float(done["f"]) if solver.stats()["success"] else np.inf
 
