@@ -51,7 +51,7 @@ def test_the_plan_is_the_optimum_that_ipopt_finds(law, seed):
     shooting = law.shooting
     x, u, _, cost = shooting.improve(shooting.begin(x0, ref.u, ref), ref, 200)
     theirs_u, theirs = PEERS[law](x0, ref, x, u)
-    # motors' limits bend at rest and at top speed, where steps stall; without their slopes one is off by 300 %
+    # limits bend at rest and at top speed, where steps stall; without their slopes one is off by 300 %
     assert cost <= theirs * (1 + (0.03 if shooting.slow else 1e-6)) + 1e-9
     v, c = x[:-1, nv + law.inputs], shooting.weights
     left = np.clip(1.0 - np.abs(v) / c.top, 0.0, 1.0)
