@@ -16,6 +16,7 @@ from .common import Broken, Ticks, fastest_joint, joint_of_largest, place_of, re
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
+from .tick import SampledTick, sampled_quickly
 from .timed import Timed, TimedInputs
 from .touch import Touch
 
@@ -64,7 +65,8 @@ class _Run:
     """State of one run."""
 
     def __init__(self, problem: Problem, t_span: tuple[float, float], controls: Controls | None) -> None:
-        self.problem, self.controls, self.t0 = problem, controls, t_span[0]
+        self.problem, self.t0 = problem, t_span[0]
+        self.controls = sampled_quickly(controls, t_span[1] - t_span[0])
         self.h = problem.step
         self.steps = round((t_span[1] - t_span[0]) / self.h)
         self.per_tick = steps_per_tick(controls, self.h)
@@ -307,6 +309,8 @@ class _Run:
             "evaluations": self.evaluations,
             "wall_s": wall,
         }
+        if isinstance(self.controls, SampledTick):
+            stats |= self.controls.stats
         return Segment(
             **recorded(self.model, self.samples, self.ticks),
             status=status,

@@ -149,7 +149,7 @@ class Run(ABC):
     def tick(self) -> Tick | None:
         """The controller's tick, where it can be compiled."""
         with self.preparing():
-            return tick_of(self.controls)
+            return tick_of(self.controls, self.steps * self.h)
 
     def ticked(self, c: Compiled, times: Array, u: Array, memory: Array) -> None:
         """Machine code has sampled the controller at ``times`` (n,), gave rows ``u`` (n, ...), and ends with

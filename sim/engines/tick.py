@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
 
-from ..compile.cache import key_of, source
+from ..compile import jit
+from ..compile.cache import Cache, default_folder, key_of, source
 from ..compile.graph import Graph, Node, Scalar, clip
+from ..compile.program import Bound, Program, map_source, obtain
 from ..compile.tape import Tape
 from ..control import Sampled
+from ..dynamics.fingerprint import code_fingerprint
 from ..dynamics.laws import LawSizes
 from ..dynamics.layout import Layout
 from ..formula import Formula
-from .interface import Array, Controls
+from .interface import Array, Controls, Held
+
+WORTH = 1000
+"""Ticks of a run from which on compiling them pays: what Python needs for fewer, a compiler needs too."""
+
+_CHUNK = 1024  # ticks whose rows are evaluated at once
 
 
 class Tick:
@@ -74,11 +83,53 @@ class Tick:
         return ctrl, [0.0 if dof in driven else x for dof, x in enumerate(forces)]
 
 
-def tick_of(controls: Controls | None) -> Tick | None:
-    """The tick of controls that can be compiled; None of others."""
-    if not isinstance(controls, Sampled) or controls.formula is None:
+class SampledTick:
+    """`Sampled` by machine code, for engines whose loop is not: `Controls` of the whole model."""
+
+    def __init__(self, tick: Tick) -> None:
+        begun = time.perf_counter()
+        self.tick, self.period = tick, tick.controls.period
+        layout = Layout(tick.controls.clip.model, forces=True)
+        sizes = repr((layout.blocks, layout.na, layout.nu))
+        key = key_of(tick.key, sizes, code_fingerprint(), repr((jit.llvm_version(), jit.host())))
+        code = obtain("tick", 1, Cache(default_folder()), key, lambda: map_source(tick.tape(layout), 1))
+        self._bound = Bound(Program(code, 1))
+        ins, outs = self._bound.inputs, self._bound.outputs
+        ins["g"][:], ins["m"][:] = tick.formula.gains, tick.memory
+        self._q, self._v, self._r, self._m = (ins[name] for name in "qvrm")
+        self._u, self._after, self._own = outs["u"], outs["m"], len(layout.u_held)
+        self._first, self._rows, self._sound = -1, np.zeros((0, 0)), True
+        self.stats = {"build_s": time.perf_counter() - begun, "build_cached": code.build.cached}
+
+    def sample(self, k: int, t: float, q: Array, v: Array) -> Held:
+        """See `Controls`."""
+        first = k - k % _CHUNK
+        if first != self._first:
+            self._first, self._rows = first, self.tick.controls.rows(first, _CHUNK)
+            self._sound = bool(np.isfinite(self._rows).all())
+        if not self._sound:
+            self.tick.remember(t - self.period, self._m)
+            held = self.tick.controls.sample(k, t, q, v)  # where it is told what is wrong
+            self._m[:] = self.tick.memory
+            return held
+        self._q[:], self._v[:], self._r[:] = q, v, self._rows[k - first]
+        self._bound()
+        self._m[:] = self._after
+        u = self._u.copy()
+        return Held(u[: self._own], u[self._own :])
+
+
+def tick_of(controls: Controls | None, seconds: float) -> Tick | None:
+    """The tick of controls that can be compiled, where a run of so many ``seconds`` is worth it, or None."""
+    if not isinstance(controls, Sampled) or seconds < WORTH * controls.period or controls.formula is None:
         return None
     return Tick(controls, controls.formula)
+
+
+def sampled_quickly(controls: Controls | None, seconds: float) -> Controls | None:
+    """``controls``, by machine code where that is worth it in a run of so many ``seconds``."""
+    tick = tick_of(controls, seconds)
+    return controls if tick is None else SampledTick(tick)
 
 
 def _whole(places: Sequence[int], nodes: Sequence[Node]) -> list[Scalar]:
