@@ -10,32 +10,37 @@ from pantograph.sim import Scene, make_plan
 from pantograph.sim.compose import make_engine, make_law
 from pantograph.sim.control import Sampled
 from pantograph.sim.dynamics.smooth import compile_model
-from pantograph.sim.engines.interface import Held, Problem
+from pantograph.sim.engines.interface import Problem
 from rich.console import Console
 
 ARM = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll"]
-PERIOD, SECONDS, ROUNDS = 1e-3, 1.0, 9
-LAWS = ("pd", "lqr", "computed-torque")
+PERIOD, SHORT, LONG, ROUNDS = 1e-3, 1.0, 5.0, 9
+LAWS = ("pd", "pid", "lqr", "computed-torque")
 
 
-class Replay:
-    """Controls that give what was recorded: the engine's own tick without a law."""
+class Unknown:
+    """A law that engines know nothing of, so that Python samples it."""
 
-    def __init__(self, forces: np.ndarray, nu: int) -> None:
-        self.period, self.held = PERIOD, [Held(np.zeros(nu), row) for row in forces]
+    def __init__(self, law) -> None:
+        self.law, self.start = law, law.start
 
-    def sample(self, k, t, q, v):
-        return self.held[k]
+    def __call__(self, *sample):
+        return self.law(*sample)
 
 
 def arm(engine: str) -> Problem:
     rng = np.random.default_rng(0)
     keys = [
-        {"joint": j, "times": [0, 0.5, 1.0], "values": rng.uniform(-0.4, 0.4, 3).tolist(), "curve": "clamped"}
+        {
+            "joint": j,
+            "times": np.linspace(0, LONG, 11),
+            "values": rng.uniform(-0.4, 0.4, 11),
+            "curve": "clamped",
+        }
         for j in ARM
     ]
     scene = Scene(
-        duration=SECONDS,
+        duration=LONG,
         models=[{"file": "arm6"}],
         roles={"tracked": ARM},
         actuators={"*": "off"},
@@ -48,35 +53,42 @@ def arm(engine: str) -> Problem:
 
 
 def tick(console: Console) -> list[Figure]:
-    """Runs with each law, with its recorded forces instead, and the steps of physics alone, in turn."""
+    """Runs with each law, in machine code and by Python, and the steps of physics alone, in turn."""
     return [figure for name in ("smooth", "contact") for figure in of_engine(name)]
 
 
 def of_engine(name: str) -> list[Figure]:
-    problem, engine, ticks = arm(name), make_engine(name), round(SECONDS / PERIOD)
+    """What a second more of simulated time costs, so that what a run costs once is no part of it."""
+    problem, engine = arm(name), make_engine(name)
     laws = {law: make_law(law, problem, {}, PERIOD) for law in LAWS}
+    laws |= {f"{law} by Python": Unknown(laws[law]) for law in LAWS}
 
-    def controlled(law: str):
-        return engine.run(problem, (0.0, SECONDS), Sampled(laws[law], problem, PERIOD))
+    def controlled(law: str, seconds: float):
+        return engine.run(problem, (0.0, seconds), Sampled(laws[law], problem, PERIOD))
 
-    forces = controlled("computed-torque").tick_qfrc
-    runs = {law: partial(controlled, law) for law in LAWS}
-    replay = Replay(forces, problem.model.nu)
-    runs["recorded forces"] = lambda: engine.run(problem, (0.0, SECONDS), replay)
-    runs["steps"] = _steps(problem, forces) if name == "smooth" else _mujoco(problem, forces)
+    forces = controlled("computed-torque", LONG).tick_qfrc
+    runs = {law: partial(controlled, law) for law in laws}
+    runs["physics"] = _steps(problem, forces) if name == "smooth" else _mujoco(problem, forces)
     times = {what: [] for what in runs}
     for again in range(ROUNDS + 1):
         for what, work in runs.items():
-            begun = time.thread_time()
-            work()
+            took = []
+            for seconds in (SHORT, LONG):
+                begun = time.thread_time()
+                work(seconds)
+                took.append(time.thread_time() - begun)
             if again:  # the first builds and warms
-                times[what].append((time.thread_time() - begun) / ticks)
+                times[what].append((took[1] - took[0]) * PERIOD / (LONG - SHORT))
     took = {what: np.array(each) for what, each in times.items()}
-    figures = [told(f"{name} engine, arm6: physics of 1 ms", 1e6 * float(np.median(took["steps"])), "us")]
-    for what in ("recorded forces", *LAWS):
-        middle, spread = ratio(took, what, "steps")
-        figures.append(told(f"{name} engine, {what}: tick", 1e6 * float(np.median(took[what])), "us"))
-        figures.append(told(f"{name} engine, {what}: tick / physics of a period", middle, "", spread))
+    figures = [told(f"{name} engine, arm6: physics of 1 ms", 1e6 * float(np.median(took["physics"])), "us")]
+    for law in laws:
+        middle, spread = ratio(took, law, "physics")
+        cost = 1e6 * float(np.median(took[law]))
+        figures.append(
+            told(
+                f"{name} engine, {law}: 1 ms with its tick / physics", middle, "", f"{cost:.2f} us; {spread}"
+            )
+        )
     return figures
 
 
@@ -85,7 +97,12 @@ def _steps(problem: Problem, forces: np.ndarray):
     smooth = compile_model(problem.model, forces=True)
     q, v, _ = problem.state0
     u = np.hstack([np.zeros((len(forces), smooth.layout.nu - forces.shape[1])), forces])
-    return lambda: smooth.rollout(q, v, u, step=PERIOD, steps=len(forces), every=len(forces))
+
+    def run(seconds: float):
+        steps = round(seconds / PERIOD)
+        smooth.rollout(q, v, u[:steps], step=PERIOD, steps=steps, every=steps)
+
+    return run
 
 
 def _mujoco(problem: Problem, forces: np.ndarray):
@@ -93,10 +110,10 @@ def _mujoco(problem: Problem, forces: np.ndarray):
     model, data = problem.model, mujoco.MjData(problem.model)
     model.opt.timestep = PERIOD
 
-    def run():
+    def run(seconds: float):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], _ = problem.state0
-        for row in forces:
+        for row in forces[: round(seconds / PERIOD)]:
             data.qfrc_applied[:] = row
             mujoco.mj_step(model, data)
 
