@@ -200,6 +200,37 @@ def test_a_fit_starts_against_friction():
     assert found.certificate.limits <= 1 + 1e-3
 
 
+PENDULUMS = """<mujoco><worldbody><body pos="0 0 1"><joint name="driven" type="{kind}" axis="{axis}"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -{up}" size=".02" mass="{big}" contype="0" conaffinity="0"/>
+  <body pos="0 0 -{up}"><joint name="loose" axis="0 1 0" frictionloss="{dry}"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -{low}" size=".02" mass="{small}" contype="0" conaffinity="0"/>
+  </body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_friction_that_nothing_drives_holds_where_it_turns(seed):
+    """Between nodes, by MuJoCo's inverse dynamics: what hangs swings to and fro under its friction alone."""
+    rng = np.random.default_rng(seed)
+    low, small = rng.uniform(0.2, 0.6), rng.uniform(0.2, 1.0)
+    words = {"kind": ("slide", "hinge")[seed % 2], "axis": ("1 0 0", "0 1 0")[seed % 2], "up": 0.3, "big": 2}
+    dry = rng.choice([0.01, 0.1, 0.3]) * small * low * 2.0
+    model = mujoco.MjModel.from_xml_string(PENDULUMS.format(low=low, small=small, dry=dry, **words))
+    seconds = rng.uniform(0.8, 2.0)
+    clip = move(model, "driven", np.linspace(0, seconds, 4), [0.0, *rng.uniform(-0.6, 0.6, 3)])
+    able = machine(model, driven=np.array([True, False]))
+    found = fit(clip, able, hard=[seconds])
+    assert found.certificate.holds
+    t = np.linspace(0, seconds, 20001)
+    data, need = mujoco.MjData(able.model), []
+    for row in zip(*found.clip.evaluate(t, left=True), strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = row
+        mujoco.mj_inverse(able.model, data)
+        dry_now = dry * row[1][1] / np.hypot(row[1][1], 0.01)
+        need.append(data.qfrc_inverse + np.array([0.0, dry_now]))
+    need = np.abs(need)
+    assert need[:, 1].max() <= 1.01e-3 * need.max()
+
+
 HOPPER = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/><body name="trunk" pos="0 0 0">
   <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
   <geom size=".1" mass="3" contype="0" conaffinity="0"/>

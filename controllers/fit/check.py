@@ -13,7 +13,7 @@ from ...models import dof_names
 from ...sim.clip import Clip, FreeTrack, Motion, Track
 from ...sim.curves import Curve
 from .contact import Phase, missing
-from .machine import WIDTH, Machine
+from .machine import Machine
 
 Array = NDArray[np.float64]
 MISSING = "missing force"
@@ -254,14 +254,14 @@ def forces(motion: Motion, machine: Machine) -> Array:
     """Joint forces (n, nv) that rows of motion need, with what overcomes dry friction.
 
     Friction opposes motion, and where a freedom rests it bears what it can. Where nothing drives a freedom
-    it is that of :data:`~.machine.WIDTH`: no force of a drive is there to make up for a jump.
+    it is the one smoothed below the machine's ``width``: no force of a drive is there to make up for a jump.
     """
     tau, f = rigid(motion, machine), machine.friction
     if not f.any():
         return tau
     v = motion.v
     rests = np.abs(v) <= 1e-9 * (1.0 + np.abs(v).max(initial=0.0))
-    sliding = np.where(machine.driven, np.sign(v), v / np.sqrt(v**2 + WIDTH**2))
+    sliding = np.where(machine.driven, np.sign(v), v / np.sqrt(v**2 + machine.width**2))
     return np.asarray(tau + np.where(rests, -np.clip(tau, -f, f), f * sliding))
 
 

@@ -18,14 +18,16 @@ class Certificate:
     """How possible a fitted motion is, on a grid ten times finer than the one it was computed on.
 
     ``limits``: largest share of any limit in use; ``dynamics``: largest force missing where nothing drives,
-    relative to the largest force at all; ``contact``: how far sites that rest stray [m]; ``holds``: whether
-    all are within ``tolerance`` (contact: of the model's size); ``solver``: what IPOPT left of its
-    constraints; ``status``: its words; ``iterations``, ``seconds`` and ``pieces`` of the last grid.
+    relative to the ``largest`` joint force at all [N m, N]; ``contact``: how far sites that rest stray [m];
+    ``holds``: whether all are within ``tolerance`` (contact: of the model's size); ``solver``: what IPOPT
+    left of its constraints; ``status``: its words; ``iterations``, ``seconds`` and ``pieces`` of the last
+    grid.
     ``by_piece`` (pieces,): the larger of what limits and dynamics miss on each piece, in tolerances.
     """
 
     limits: float
     dynamics: float
+    largest: float
     contact: float
     tolerance: float
     holds: bool

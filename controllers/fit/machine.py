@@ -30,7 +30,8 @@ class Machine:
     [rad/s^3, m/s^3]; ``force_low``, ``force_high`` at standstill [N m, N]; ``top_speed``: where a motor gives
     nothing more (its force falls in a straight line); ``current`` [A] of the battery, drawn at ``ampere``
     [A/(N m), A/N] of each joint's force. ``driven`` (nv,): freedoms with a drive; the others take no force.
-    ``friction``: dry friction of the model [N m, N], which opposes motion and holds what rests.
+    ``friction``: dry friction of the model [N m, N], which opposes motion and holds what rests; ``width``:
+    the speed [rad/s, m/s] below which it is smoothed where nothing drives.
     """
 
     nominal: Nominal
@@ -46,6 +47,7 @@ class Machine:
     current: float
     driven: NDArray[np.bool_]
     friction: Array
+    width: float = WIDTH
 
     @property
     def asks_forces(self) -> bool:

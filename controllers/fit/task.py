@@ -22,7 +22,7 @@ LIMITS = ("velocity", "acceleration", "jerk", "force", "top_speed", "ampere")
 
 
 class Task(NamedTuple):
-    """The plan of the scene, its keys, its machine, the arguments of :func:`~.collocate.fit`, and how near a
+    """The plan of the scene, its keys, its machine, the arguments of :func:`~.spacetime.fit`, and how near a
     proof has to be [rad, m]."""
 
     plan: Plan

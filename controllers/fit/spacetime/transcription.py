@@ -8,19 +8,18 @@ which decides their forces there; positions and velocities then stay as they wer
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import lookup
-from ...sim.clip import Clip
-from ...sim.errors import PantographError
-from ..nominal import difference, moved
-from .charts import Charts
-from .contact import Phase, carried, independent, places, sites_of, touching
-from .machine import WIDTH, Machine
+from ....models import lookup
+from ....sim.clip import Clip
+from ....sim.errors import PantographError
+from ...nominal import difference, moved
+from ..charts import Charts
+from ..contact import Phase, carried, independent, places, sites_of, touching
+from ..machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
@@ -59,16 +58,6 @@ class Program(NamedTuple):
     cost: Any
     g: Any
     equal: int
-
-
-def grid(wish: Wish, step: float) -> Array:
-    """Times at most ``step`` [s] apart, each hard key and each begin and end of a contact among them."""
-    clip = wish.clip
-    corners = [clip.start, clip.end, *wish.hard, *(t for p in wish.phases for t in (p.start, p.stop))]
-    edges = np.unique(np.clip(corners, clip.start, clip.end))
-    edges = edges[np.append(True, np.diff(edges) > 1e-9)]
-    pieces = [np.linspace(a, b, int(np.ceil((b - a) / step - 1e-9)) + 1)[:-1] for a, b in pairwise(edges)]
-    return np.append(np.concatenate(pieces), edges[-1])
 
 
 def moving(machine: Machine, wish: Wish) -> NDArray[np.bool_]:
@@ -129,7 +118,9 @@ class Transcription:
             pushed = ca.Function("pushed", [at, v, f], [ca.gradient(power, v)])
             need -= pushed(q, v, f)
         for rubs in np.flatnonzero(self.machine.friction).tolist():
-            need[rubs] += self.machine.friction[rubs] * v[rubs] / ca.sqrt(v[rubs] ** 2 + WIDTH**2)
+            width = WIDTH if self.machine.driven[rubs] else self.machine.width
+            dry = v[rubs] / ca.sqrt(v[rubs] ** 2 + width**2)
+            need[rubs] += self.machine.friction[rubs] * dry
         size = np.maximum(self.strength, 0.1 * self.strength.max())
         rows = np.flatnonzero(self.inside).tolist()
         return ca.Function("balance", [wanted, x, v, a, tau, f], [(need / ca.DM(size))[rows]])

@@ -15,19 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import dof_names, name_of
-from ...sim.clip import Clip
-from ...sim.errors import PantographError
-from ...sim.kinds import SCALAR
+from ....models import dof_names, name_of
+from ....sim.clip import Clip
+from ....sim.errors import PantographError
+from ....sim.kinds import SCALAR
+from ..contact import Phase
+from ..fitted import Certificate, Fitted
+from ..machine import Machine
+from ..watch import interruptible, watch
 from .certify import examine
-from .contact import Phase
-from .fitted import Certificate, Fitted
-from .machine import Machine
-from .transcription import Point, Transcription, Wish, grid
-from .watch import interruptible, watch
+from .mesh import grid, refined
+from .transcription import Point, Transcription, Wish
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
+_CLOSE = 5.0  # tolerances missed with which friction is made sharper
+_REACHED = 1e-5  # what constraints may be missed by
 
 
 def fit(
@@ -54,8 +57,9 @@ def fit(
     with keys and without a drive, at any. What has neither is free at the end. ``step`` [s] is the longest
     piece of the first grid, ``most`` the most iterations on one.
 
-    Dry friction is smoothed below :data:`~.machine.WIDTH`; a drive has to be able to overcome all of it where
-    a joint is as slow, also where it could help to hold.
+    Dry friction is smoothed at low speed, where nothing drives below the machine's ``width``, and wider ones
+    at first; a drive has to be able to overcome all of it where a joint is as slow, also where it could help
+    to hold.
 
     Up to ``refine`` times, the pieces on which the motion does not hold to ``tolerance`` (limits, and forces
     missing relative to the largest) are cut, and limits are drawn in by what it exceeds them between points;
@@ -75,21 +79,35 @@ def fit(
     wish = Wish(clip, tuple(hard), tuple(phases), effort, deviation, at_rest)
     if text := _hopeless(wish, machine):
         raise PantographError(f"no motion fits: {text}")
-    nodes, margin, found, before = grid(wish, step), 1.0, None, None
-    for round_ in range(refine + 1):
+    nodes, margin, found, before = grid(clip, hard, phases, step), 1.0, None, None
+    widths = _widths(machine)
+    rounds = refine + len(widths)
+    able = replace(machine, width=widths.pop(0))
+    for round_ in range(rounds):
         missed = "" if found is None else f", missed {found.certificate.by_piece.max():.3g} tolerances"
-        words = f"grid {round_ + 1} of {refine + 1} at most, {len(nodes) - 1} pieces{missed}"
+        words = f"grid {round_ + 1} of {rounds} at most, {len(nodes) - 1} pieces{missed}"
         each = None if progress is None else partial(_tell, progress, words)
-        problem = Transcription(wish, _drawn_in(machine, margin), nodes)
-        found, before = _solve(problem, machine, tolerance, most, before, each)
+        problem = Transcription(wish, _drawn_in(able, margin), nodes)
+        found, before = _solve(problem, able, tolerance, most, before, each)
         certificate = found.certificate
-        if certificate.holds:
+        if certificate.holds and not widths:
             break
         if certificate.limits > 1.0 + tolerance and (round_ > 0 or certificate.limits < 1.02):
             margin = max(0.9, margin / certificate.limits)
-        nodes = _refined(nodes, certificate.by_piece)
+        if widths and certificate.by_piece.max() <= _CLOSE:
+            able = replace(machine, width=widths.pop(0))
+        nodes = refined(nodes, certificate.by_piece, found.clip, able, tolerance * certificate.largest)
     assert found is not None
     return found
+
+
+def _widths(machine: Machine) -> list[float]:
+    """Speeds below which friction is smoothed, round by round.
+
+    Where nothing drives, a turn of friction is as short as it is sharp, and shifts until grids resolve it.
+    """
+    passive = (machine.friction > 0) & ~machine.driven
+    return [k * machine.width for k in ((8.0, 4.0, 2.0, 1.0) if passive.any() else (1.0,))]
 
 
 def _hopeless(wish: Wish, machine: Machine) -> str | None:
@@ -147,16 +165,6 @@ def _drawn_in(machine: Machine, margin: float) -> Machine:
     )
 
 
-def _refined(nodes: Array, missed: Array) -> Array:
-    """Nodes with the pieces cut that miss something, into as many as errors of third order ask for."""
-    # half of what is allowed, so that its share of the next round's changes fits in
-    cuts = np.clip(np.ceil(np.cbrt(2.0 * missed)), 1, 4).astype(int)
-    if cuts.max() == 1:
-        cuts[:] = 2  # contacts stray: an error of the whole
-    parts = [np.linspace(a, b, k + 1)[:-1] for a, b, k in zip(nodes[:-1], nodes[1:], cuts, strict=True)]
-    return np.append(np.concatenate(parts), nodes[-1])
-
-
 def _solve(
     problem: Transcription,
     true: Machine,
@@ -176,16 +184,21 @@ def _solve(
     lower = np.concatenate([np.zeros(program.equal), np.full(count - program.equal, -np.inf)])
     begun = time.perf_counter()
     guard = watch(int(program.x.numel()), count, each)
-    options = _options(most, before is not None) | {"iteration_callback": guard}
-    solver = ca.nlpsol("fit", "ipopt", {"x": program.x, "f": program.cost, "g": program.g}, options)
-    start = problem.guess() if before is None else _between(problem, *before)
-    with interruptible(guard):
-        done = solver(x0=problem.pack(start), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(count))
+    rest = np.inf
+    for warm in (True, False) if before is not None else (False,):
+        options = _options(most, warm) | {"iteration_callback": guard}
+        solver = ca.nlpsol("fit", "ipopt", {"x": program.x, "f": program.cost, "g": program.g}, options)
+        start = _between(problem, *before) if warm and before is not None else problem.guess()
+        with interruptible(guard):
+            done = solver(x0=problem.pack(start), lbx=low, ubx=high, lbg=lower, ubg=np.zeros(count))
+        left = np.asarray(done["g"]).ravel()
+        over = left[program.equal :].max(initial=0.0)
+        rest = float(max(np.abs(left[: program.equal]).max(initial=0.0), over))
+        if rest <= _REACHED:
+            break
     seconds, stats = time.perf_counter() - begun, solver.stats()
     words = str(stats["return_status"]).replace("_", " ").lower()
-    left = np.asarray(done["g"]).ravel()
-    rest = float(max(np.abs(left[: program.equal]).max(initial=0.0), left[program.equal :].max(initial=0.0)))
-    if not rest <= 1e-5:
+    if not rest <= _REACHED:
         raise PantographError(
             f"no motion was found that fits: constraints are missed by {rest:.2g} after "
             f"{stats['iter_count']} iterations ({words}); loosen hard keys, give more time, or a "
@@ -200,6 +213,7 @@ def _solve(
     certificate = Certificate(
         limits=float(finding.limits.max(initial=0.0)),
         dynamics=float(finding.dynamics.max(initial=0.0)),
+        largest=finding.largest,
         contact=finding.contact,
         tolerance=tolerance,
         holds=bool(max(by_piece.max(initial=0.0), slip / tolerance) <= 1.0),
@@ -232,7 +246,7 @@ def _options(most: int, warm: bool) -> dict[str, Any]:
         "acceptable_iter": 5,
     }
     if warm:
-        ipopt |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+        ipopt |= {"mu_init": 1e-7, "bound_push": 1e-6, "bound_frac": 1e-6, "acceptable_tol": 1e-5}
     return {"print_time": False, "error_on_fail": False, "ipopt": ipopt}
 
 

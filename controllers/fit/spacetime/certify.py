@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.clip import Clip
-from .check import MISSING, follow, forces, shares
-from .contact import Phase, places
-from .machine import Machine
+from ....sim.clip import Clip
+from ..check import MISSING, follow, forces, shares
+from ..contact import Phase, places
+from ..machine import Machine
 
 Array = NDArray[np.float64]
 _FINER = 10
@@ -19,11 +19,12 @@ _FINER = 10
 
 class Finding(NamedTuple):
     """On each piece (pieces,): largest share of a limit in use, largest missing force relative to the largest
-    at all; and how far resting sites stray at most [m]."""
+    at all; how far resting sites stray at most [m]; and that ``largest`` force [N m, N]."""
 
     limits: Array
     dynamics: Array
     contact: float
+    largest: float
 
 
 def examine(
@@ -51,7 +52,7 @@ def examine(
     missing = np.abs(need[:, loose]).max(axis=1, initial=0.0) / largest
     for used in (row.share for row in shares(trace, machine, need=need) if row.kind != MISSING):
         share = np.maximum(share, used.reshape(pieces, -1).max(axis=1))
-    return Finding(share, missing.reshape(pieces, -1).max(axis=1), stray)
+    return Finding(share, missing.reshape(pieces, -1).max(axis=1), stray, largest)
 
 
 def _strays(p: Array, t: Array, sites: Sequence[str], phases: Sequence[Phase]) -> float:
