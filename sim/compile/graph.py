@@ -286,10 +286,14 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
     return graph.binary(ATAN2, y, x) if graph else math.atan2(float(y), float(x))
 
 
-def clip(x: Scalar, low: float, high: float) -> Scalar:
-    """`x` limited to [low, high], either of which may be infinite."""
-    x = x if math.isinf(low) else maximum(x, low)
-    return x if math.isinf(high) else minimum(x, high)
+def clip(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
+    """`x` limited to [low, high]; bounds that are infinite numbers cost nothing."""
+    x = x if _infinite(low) else maximum(x, low)
+    return x if _infinite(high) else minimum(x, high)
+
+
+def _infinite(x: Scalar) -> bool:
+    return not isinstance(x, Node) and math.isinf(x)
 
 
 def reachable(outputs: Iterable[Scalar]) -> list[Node]:

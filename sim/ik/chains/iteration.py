@@ -254,7 +254,7 @@ def moved(problem: Problem, q: Sequence[Node], given: Split, d: dict[int, Scalar
     for i, v in zip(space.scalar_q, space.scalar_v, strict=True):
         if v in d:
             x = q[i] + d[v]
-            out[i] = clip(x, given.low[v], given.high[v]) if v in given.low else x  # type: ignore[arg-type]
+            out[i] = clip(x, given.low[v], given.high[v]) if v in given.low else x
     for i, v in space.shifts:
         for k in range(3):
             out[i + k] = q[i + k] + d.get(v + k, 0.0)
