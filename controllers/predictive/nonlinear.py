@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...models import name_of
 from ...sim.clip import Clip
 from ...sim.control import Target
+from ...sim.dynamics.smooth import compile_model
 from ...sim.errors import PantographError
 from ...sim.kinds import FREE, SCALAR
 from ..design.linear import held_matrices, linearise_path
@@ -47,8 +48,8 @@ class NMPC:
     ``velocity`` and ``force`` weights on deviations from the keys (``goal`` [rad, m] for joints
     without: joint -> value), with the LQR's value as the cost to go. Ranges of joints are soft: leaving one
     costs ``soft`` times the position weight. Joints ``keyed`` (nv,) are foreseen as they will move. The first
-    sample plans until nothing is left to gain, each later one makes ``iterations`` improvements. What drives
-    lose towards their ``top_speed`` [rad/s, m/s] is foreseen.
+    sample plans until nothing is left to gain, each later one makes up to ``iterations`` improvements. What
+    drives lose towards their ``top_speed`` [rad/s, m/s] is foreseen.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class NMPC:
         force: Gain | None = None,
         goal: Mapping[str, float] | None = None,
         soft: float = 100.0,
-        iterations: int = 1,
+        iterations: int = 4,
     ) -> None:
         _predictable(model, tracked | keyed)
         self.clip, _ = aimed(clip, {} if goal is None else goal, "the NMPC's goal")
@@ -99,7 +100,8 @@ class NMPC:
             self.Q, self.R, self.regulator.P, self.soft, q_low[free], q_high[free], low, high, top
         )  # fmt: skip
         inputs = np.flatnonzero(self.tracked[free])
-        return Shooting(self.nominal.smooth_with(self.keyed), inputs, self.step, weights)
+        pushed = compile_model(self.nominal.model, keyed=self.keyed, forces=True)
+        return Shooting(self.nominal.smooth_with(self.keyed), pushed, inputs, self.step, weights)
 
     @cached_property
     def regulator(self) -> Regulator:
@@ -164,7 +166,7 @@ class NMPC:
         if kept and since > 0.0:  # where the plan meant to be by now
             X[0] = shooting.advance(X[0], u[0], since, np.tile(ref.w[0, 0], (3, 1)))
         path, u = shooting.follow(x, Plan(X, u, K, np.inf), ref)
-        cost = shooting.cost(path, u, ref)
+        cost = float(shooting.cost(path, u, ref))
         return Plan(path, u, K, cost) if np.isfinite(cost) else shooting.begin(x, ref.u, ref)
 
 

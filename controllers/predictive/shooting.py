@@ -17,9 +17,11 @@ from ...sim.dynamics.smooth import Smooth
 from ..drives import at_speed, by_speed
 from .bounded import bounded_minimum
 from .coordinates import Coordinates
+from .following import Following
 
 Array = NDArray[np.float64]
 _RETRIES = 3  # more cautious tries, where a step does not help
+_SHARES = np.array([1.0, 0.5, 0.2, 0.05])[:, None, None]  # of a step, tried side by side
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +66,15 @@ class Weights:
 
 
 class Shooting:
-    """Predictions of ``smooth`` by RK4 in steps of ``step`` [s], forces on its freedoms ``inputs`` (m,)."""
+    """Predictions of ``smooth`` by RK4 in steps of ``step`` [s], forces on its freedoms ``inputs`` (m,).
 
-    def __init__(self, smooth: Smooth, inputs: NDArray[np.intp], step: float, weights: Weights) -> None:
+    ``pushed`` is the same model with joint forces (nv,) as its last controls.
+    """
+
+    def __init__(
+        self, smooth: Smooth, pushed: Smooth, inputs: NDArray[np.intp], step: float, weights: Weights
+    ) -> None:
+        self.pushed = pushed
         self.smooth, self.inputs, self.step, self.weights = smooth, inputs, step, weights
         self.coordinates, self.nq, self.nv = Coordinates(smooth.layout), smooth.layout.nq, smooth.layout.nv
         self.slow = bool(np.isfinite(weights.top).any())
@@ -89,33 +97,45 @@ class Shooting:
         keep to it."""
         K = np.zeros((*u.shape, 2 * self.nv))
         path, u = self.follow(x, Plan(ref.x, u, K, np.inf), ref)
-        return Plan(path, u, K, self.cost(path, u, ref))
+        return Plan(path, u, K, float(self.cost(path, u, ref)))
 
     def follow(self, x: Array, plan: Plan, ref: Horizon, change: Array | float = 0.0) -> tuple[Array, Array]:
-        """States and forces from x (nq + nv,) on that keep to a plan with ``change`` (n, m) added to its
-        forces, within their bounds."""
-        states, forces = np.empty((len(plan.u) + 1, len(x))), np.empty_like(plan.u)
-        states[0], wanted = x, plan.u + change
-        for k in range(len(forces)):
-            raw = wanted[k] + plan.K[k] @ self.away(states[k], plan.x[k])
-            low, high = self.able(states[k])
-            forces[k] = np.minimum(np.maximum(raw, low), high)
-            states[k + 1] = self.advance(states[k], forces[k], ref.h[k], ref.w[k])
-        return states, forces
+        """States (..., n + 1, nq + nv) and forces (..., n, m) from x (nq + nv,) on that keep to a plan with
+        ``change`` (..., n, m) added to its forces, within their bounds."""
+        c, (n, m), nq = self.weights, plan.u.shape, self.nq
+        wanted = plan.u + change
+        lead = wanted.shape[:-2]
+        kept = np.concatenate([plan.x[:n], np.zeros((n, m)), plan.K.reshape(n, -1)], axis=1)
+        rows = np.broadcast_to(kept, (*lead, *kept.shape)).copy()
+        rows[..., len(x) : len(x) + m] = wanted
+        motors, states = np.concatenate([c.low, c.high, 1.0 / c.top]), np.broadcast_to(x, (*lead, len(x)))
+        inputs, X, U = tuple(self.inputs.tolist()), [states[..., None, :]], []
+        # the first step is what is left of one in progress
+        for steps, h in ((slice(0, 1), ref.h[0]), (slice(1, n), self.step)):
+            if (count := steps.stop - steps.start) == 0:
+                break
+            law = Following(0.0, inputs=inputs, rows=rows[..., steps, :], motors=motors)
+            w = ref.w[steps][:, (0, 1, 1, 2)].reshape(4 * count, -1) if ref.w.shape[2] else None
+            path = self.pushed.rollout(states[..., :nq], states[..., nq:], law, step=h, steps=count, w=w)
+            X.append(np.concatenate([path.q, path.v], axis=-1)[..., 1:, :])
+            U.append(path.u[..., self.pushed.layout.nu - self.nv + self.inputs])
+            states = X[-1][..., -1, :]
+        return np.concatenate(X, axis=-2), np.concatenate(U, axis=-2)
 
-    def cost(self, x: Array, u: Array, ref: Horizon) -> float:
-        """Cost of states (n + 1, nq + nv) and forces (n, m)."""
+    def cost(self, x: Array, u: Array, ref: Horizon) -> Array:
+        """Costs (...,) of states (..., n + 1, nq + nv) and forces (..., n, m)."""
         c, du = self.weights, u - ref.u
         beyond, share = self._beyond(x), ref.h / self.step
         with np.errstate(over="ignore", invalid="ignore"):  # a plan that flies off costs infinitely much
             dx = self.away(x, ref.x)
-            total = share @ (dx[:-1] ** 2 @ c.Q + du**2 @ c.R) + dx[-1] @ c.final @ dx[-1]
-            total += np.sum(beyond**2 @ c.soft)
-        return float(total) if np.isfinite(total) else np.inf
+            last = dx[..., -1, :]
+            total = (dx[..., :-1, :] ** 2 @ c.Q + du**2 @ c.R) @ share + np.sum(beyond**2 @ c.soft, axis=-1)
+            total += np.sum(last @ c.final * last, axis=-1)
+            return np.where(np.isfinite(total), total, np.inf)
 
     def _beyond(self, x: Array) -> Array:
-        """How far scalar joints are beyond their ranges, (n + 1, nv), with its sign."""
-        q, c = self.coordinates.positions(x[:, : self.nq]), self.weights
+        """How far scalar joints are beyond their ranges, (..., nv), with its sign."""
+        q, c = self.coordinates.positions(x[..., : self.nq]), self.weights
         return np.asarray(np.maximum(q - c.q_high, 0.0) - np.maximum(c.q_low - q, 0.0))
 
     def improve(self, plan: Plan, ref: Horizon, iterations: int) -> Plan:
@@ -127,11 +147,10 @@ class Shooting:
             if gain <= 1e-9 * (1e-9 + plan.cost):
                 return plan._replace(K=K)
             steered = plan._replace(K=K)
-            for share in (1.0, 0.5, 0.2, 0.05):
-                x, u = self.follow(plan.x[0], steered, ref, share * change)
-                cost = self.cost(x, u, ref)
-                if cost < plan.cost or gain <= 1e-6 * plan.cost:
-                    break  # better, or so near the optimum that rounding decides
+            x, u = self.follow(plan.x[0], steered, ref, _SHARES * change)
+            costs = self.cost(x, u, ref)
+            k = int(np.argmin(costs))
+            cost = float(costs[k])
             if not cost < plan.cost:
                 tries += 1
                 if gain <= 1e-6 * plan.cost or tries > _RETRIES + iterations // 10 or damping > 1e6:
@@ -139,7 +158,7 @@ class Shooting:
                 damping = max(10.0 * damping, 1e-4 * float(np.trace(self.weights.final)))
                 continue
             little = plan.cost - cost <= 1e-10 * plan.cost
-            plan, done = Plan(x, u, K, cost), done + 1
+            plan, done = Plan(x[k], u[k], K, cost), done + 1
             damping = 0.1 * damping if damping > 1e-9 else 0.0
             if little:
                 break
