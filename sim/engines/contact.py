@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from ...models import captured_warnings
 from ..errors import EngineError
 from ..kinds import BALL, FREE
-from .common import Broken, Ticks, fastest_joint, joint_of_largest, place_of, recorded, steps_per_tick
+from .common import HUGE, Broken, Ticks, fastest_joint, joint_of_largest, place_of, recorded, steps_per_tick
 from .derive import apply_wrenches
 from .interface import Array, Controls, Held, Problem, Role, Segment, State
 from .prescribe import Prescriber
@@ -31,6 +33,7 @@ ORDER = {"euler": 1, "rk4": 4, "implicit": 1, "implicitfast": 1, "discrete": 1}
 
 _CHUNK = 1024  # steps whose prescribed inputs are evaluated at once
 _BLOWN_UP = (mujoco.mjtWarning.mjWARN_BADQACC, mujoco.mjtWarning.mjWARN_BADQPOS)
+_STATE = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT)
 
 
 class ContactEngine:
@@ -76,15 +79,16 @@ class _Run:
         self.model.opt.integrator = int(INTEGRATORS[problem.integrator])
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.data = mujoco.MjData(self.model)
+        self.warnings = [self.data.warning[int(w)] for w in _BLOWN_UP]
         self.timed = Timed(problem)
         self.chunk_first = -1
         self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
         self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
-        self.quat = _quaternion_joints(self.model)
-        self.evaluations = 0
+        self.joints = _places(self.model)
+        self.width = self.model.nq + self.model.nv + self.model.na
         self.touch = Touch(self.model)
         self.k = 0  # the step to come
-        self.torn: tuple[int, State] | None = None  # a step that has begun, and the state before it
+        self.torn: tuple[int, Array] | None = None  # a step that has begun, and the state before it
         self.samples: list[tuple[float, State]] = []
         self.ticks = Ticks(self.model)
 
@@ -93,10 +97,11 @@ class _Run:
         try:
             self._start()
             while True:
-                if message := self._nonsense(self.k):
+                x = self._state()
+                if message := self._nonsense(self.k, x):
                     status = "diverged"
                     break
-                self._stop_at(self.k)
+                self._stop_at(self.k, x)
                 if self.k >= self.steps:
                     break
                 self._advance(self._until_next(self.k))
@@ -118,9 +123,8 @@ class _Run:
     def _keep_last(self) -> float:
         """Record the state after the last whole step of a run that was stopped; its time [s]."""
         d = self.data
-        now = State(d.qpos.copy(), d.qvel.copy(), d.act.copy())
-        self.k, last = self.torn or (round((d.time - self.t0) / self.h), now)
-        t = self.t0 + self.k * self.h
+        self.k, x = self.torn or (round((d.time - self.t0) / self.h), self._state())
+        last, t = self._parts(x), self.t0 + self.k * self.h
         if (
             not (self.samples and self.samples[-1][0] >= t)
             and fastest_joint(self.model, last.q, last.v) is None
@@ -134,6 +138,7 @@ class _Run:
         if self.model.na:
             d.act[:] = s.act
         inputs = self.timed.at(np.array([self.t0]))
+        d.ctrl[:] = self.held.ctrl
         self._prescribe_state(inputs, 0)
         self._apply(inputs, 0)
         self.prescriber.settle(d, self.held.qfrc, inputs.a[0])
@@ -144,34 +149,33 @@ class _Run:
             stops.append(self.per_tick - k % self.per_tick)
         return min(stops)
 
-    def _stop_at(self, k: int) -> None:
-        """Record and sample the controller where step ``k`` begins, if it is time for it."""
-        t, d = self.t0 + k * self.h, self.data
+    def _stop_at(self, k: int, x: Array) -> None:
+        """Record and sample the controller at state ``x``, where step ``k`` begins, if it is time for it."""
+        t = self.t0 + k * self.h
         if k % self.problem.sample_every == 0 or k == self.steps:
-            self.samples.append((t, State(d.qpos.copy(), d.qvel.copy(), d.act.copy())))
+            self.samples.append((t, self._parts(x)))
         if self.controls and self.per_tick and k % self.per_tick == 0 and k < self.steps:
-            self.held = self.controls.sample(k // self.per_tick, t, d.qpos.copy(), d.qvel.copy())
+            q, v, _ = self._parts(x.copy())
+            self.held = self.controls.sample(k // self.per_tick, t, q, v)
             self.ticks.add(t, self.held)
 
     def _advance(self, n: int) -> None:
         step = self._plain
         if not self.timed.empty:
             step = self._runge_kutta if self.problem.integrator == "rk4" else self._native
-        self.data.ctrl[:] = self.held.ctrl
+        d, t0, h, look = self.data, self.t0, self.h, self.touch.look
+        d.ctrl[:], d.qfrc_applied[:] = self.held.ctrl, self.held.qfrc
         for k in range(self.k, self.k + n):
             if k in self.jumps:
                 self._jump(k)
             step(k)
             self.k = k + 1
-            self.touch.look(self.data, self.t0 + k * self.h)
+            look(d, t0 + k * h)
 
     def _plain(self, k: int) -> None:
         """A step without prescribed inputs; the integrator is MuJoCo's own."""
-        d = self.data
-        d.qfrc_applied[:] = self.held.qfrc
-        d.time = self.t0 + k * self.h
-        mujoco.mj_step(self.model, d)
-        self.evaluations += 4 if self.problem.integrator == "rk4" else 1
+        self.data.time = self.t0 + k * self.h
+        mujoco.mj_step(self.model, self.data)
 
     def _jump(self, k: int) -> None:
         """Velocities that keyed joints take up at once pull the others along: M_pp dv_p = -M_pk dv_k."""
@@ -184,14 +188,16 @@ class _Run:
         d.qvel[:] += dv[0]
 
     def _inputs(self, k: int) -> tuple[tuple[TimedInputs, TimedInputs, TimedInputs], int]:
-        """Prescribed inputs at the start, the middle and the end of a chunk of steps, and the row of step
-        ``k`` in them. The end is the limit from the left: keys may bend there."""
+        """Prescribed inputs at the start, the middle (where RK4 asks) and the end of a chunk of steps, and
+        the row of step ``k`` in them. The end is the limit from the left: keys may bend there."""
         first = k - k % _CHUNK
         if first != self.chunk_first:
             n, h = min(_CHUNK, self.steps - first), self.h
             begin = self.t0 + np.arange(first, first + n) * h
             end = self.t0 + np.arange(first + 1, first + n + 1) * h
-            self.chunk = (self.timed.at(begin), self.timed.at(begin + h / 2), self.timed.at(end, left=True))
+            at = self.timed.at(begin)
+            middle = self.timed.at(begin + h / 2) if self.problem.integrator == "rk4" else at
+            self.chunk = at, middle, self.timed.at(end, left=True)
             self.chunk_first = first
         return self.chunk, k - first
 
@@ -203,41 +209,33 @@ class _Run:
         """
         h, d = self.h, self.data
         (begin, middle, end), row = self._inputs(k)
-        q0, v0, act0 = d.qpos.copy(), d.qvel.copy(), d.act.copy()
-        self.torn = k, State(q0, v0, act0)
-        rates: list[tuple[Array, Array, Array]] = []
-        for inputs, c in zip((begin, middle, middle, end), (0.0, 0.5, 0.5, 1.0), strict=True):
-            if rates:
-                dq, dv, dact = rates[-1]
-                d.qpos[:], d.qvel[:], d.act[:] = q0 + c * h * dq, v0 + c * h * dv, act0 + c * h * dact
+        x0 = self._state()
+        self.torn = k, x0
+        rate, change = np.empty(self.width), np.zeros(self.width)
+        for inputs, c, weight in ((begin, 0.0, 6), (middle, 0.5, 3), (middle, 0.5, 3), (end, 1.0, 6)):
+            if c:
+                mujoco.mj_setState(self.model, d, x0 + c * h * rate, _STATE)
+                self._prescribe_state(inputs, row)
             d.time = self.t0 + (k + c) * h
-            self._prescribe_state(inputs, row)
             self._apply(inputs, row)
-            self.prescriber.forward(d, self.held.qfrc, inputs.a[row])
-            rates.append((self._qdot(), d.qacc.copy(), d.act_dot.copy()))
-        weights = (h / 6, h / 3, h / 3, h / 6)
-        d.qpos[:] = q0 + sum(w * r[0] for w, r in zip(weights, rates, strict=True))
-        d.qvel[:] = v0 + sum(w * r[1] for w, r in zip(weights, rates, strict=True))
-        d.act[:] = act0 + sum(w * r[2] for w, r in zip(weights, rates, strict=True))
+            self.prescriber.forward(d, inputs.a[row])
+            self._rate(rate)
+            change += h / weight * rate
+        mujoco.mj_setState(self.model, d, x0 + change, _STATE)
         mujoco.mj_normalizeQuat(self.model, d.qpos)
-        self.evaluations += 4
         self._land(k + 1)
 
     def _native(self, k: int) -> None:
         """MuJoCo's one-stage integrators; keyed joints get the mean acceleration over the step."""
-        h, d, p = self.h, self.data, self.prescriber
+        d, p = self.data, self.prescriber
         (begin, _, end), row = self._inputs(k)
-        self.torn = k, State(d.qpos.copy(), d.qvel.copy(), d.act.copy())
-        self._prescribe_state(begin, row)
+        self.torn = k, self._state()
         self._apply(begin, row)
-        d.qfrc_applied[:] = self.held.qfrc
-        a_key = (end.v[row] - begin.v[row]) / h
         if len(p.keyed):
-            p.push(d, a_key)
+            p.push(d, (end.v[row] - begin.v[row]) / self.h)
         mujoco.mj_step(self.model, d)
         if len(p.keyed):
             p.observe(d)
-        self.evaluations += 1
         self._land(k + 1)
 
     def _land(self, k: int) -> None:
@@ -255,33 +253,40 @@ class _Run:
         self.data.qvel[self.timed.keyed] = inputs.v[row]
 
     def _apply(self, inputs: TimedInputs, row: int) -> None:
-        """Controls and wrenches of one evaluation."""
-        d = self.data
-        d.ctrl[:] = self.held.ctrl
-        d.ctrl[self.timed.servos] = inputs.ctrl[row]
-        apply_wrenches(self.model, d, self.timed, inputs.wrench[row])
+        """Commands of servos and wrenches of one evaluation."""
+        if len(self.timed.servos):
+            self.data.ctrl[self.timed.servos] = inputs.ctrl[row]
+        if len(self.timed.bodies):
+            apply_wrenches(self.model, self.data, self.timed, inputs.wrench[row])
 
-    def _qdot(self) -> Array:
-        """Time derivative of qpos (nq,): velocities, and quaternion rates of ball and free joints."""
-        d, m = self.data, self.model
-        out = np.empty(m.nq)
-        scalar_q, scalar_v, quat_q, quat_v = self.quat
-        out[scalar_q] = d.qvel[scalar_v]
-        for iq, iv in zip(quat_q, quat_v, strict=True):
-            w, x, y, z = d.qpos[iq : iq + 4]
-            p, r, s = 0.5 * d.qvel[iv : iv + 3]
-            out[iq] = -x * p - y * r - z * s
-            out[iq + 1] = w * p + y * s - z * r
-            out[iq + 2] = w * r + z * p - x * s
-            out[iq + 3] = w * s + x * r - y * p
-        return out
+    def _rate(self, out: Array) -> None:
+        """Write the time derivative of the state (nq + nv + na,), after an evaluation there."""
+        d, m, j = self.data, self.model, self.joints
+        out[j.scalar_q] = d.qvel[j.scalar_v]
+        if len(j.quat_q):
+            out[j.quat_q] = _quaternion_rates(d.qpos[j.quat_q].tolist(), d.qvel[j.quat_v].tolist())
+        out[m.nq : m.nq + m.nv] = d.qacc
+        out[m.nq + m.nv :] = d.act_dot
 
-    def _nonsense(self, k: int) -> str:
-        """Why the state at step ``k`` makes no sense, or an empty string."""
-        d, m = self.data, self.model
-        joint = fastest_joint(m, d.qpos, d.qvel)
-        if any(d.warning[int(w)].number for w in _BLOWN_UP):
-            joint = joint_of_largest(m, np.abs(d.qacc))
+    def _state(self) -> Array:
+        """The state (nq + nv + na,): q, v, act."""
+        x = np.empty(self.width)
+        mujoco.mj_getState(self.model, self.data, x, _STATE)
+        return x
+
+    def _parts(self, x: Array) -> State:
+        nq, nv = self.model.nq, self.model.nv
+        return State(x[:nq], x[nq : nq + nv], x[nq + nv :])
+
+    def _nonsense(self, k: int, x: Array) -> str:
+        """Why the state ``x`` at step ``k`` makes no sense, or an empty string."""
+        bad_acceleration, bad_position = self.warnings
+        blown_up = bad_acceleration.number or bad_position.number
+        if math.hypot(*x.tolist()) < HUGE and not blown_up:  # nearly always, and quickly told
+            return ""
+        joint = fastest_joint(self.model, *self._parts(x)[:2])
+        if blown_up:
+            joint = joint_of_largest(self.model, np.abs(self.data.qacc))
         if joint is None:
             return ""
         return (
@@ -306,7 +311,7 @@ class _Run:
             "integrator": self.problem.integrator,
             "step": self.h,
             "steps": k,
-            "evaluations": self.evaluations,
+            "evaluations": k * (4 if self.problem.integrator == "rk4" else 1),
             "wall_s": wall,
         }
         if isinstance(self.controls, SampledTick):
@@ -320,22 +325,49 @@ class _Run:
         )
 
 
-def _quaternion_joints(model: mujoco.MjModel) -> tuple[Array, Array, list[int], list[int]]:
-    """Indices (qpos, dof) of coordinates that are their own rates, and starts of quaternion parts."""
+class _Places(NamedTuple):
+    """Where in qpos and qvel are coordinates whose rates are velocities (n,) and quaternions (m, 4 and 3)."""
+
+    scalar_q: NDArray[np.intp]
+    scalar_v: NDArray[np.intp]
+    quat_q: NDArray[np.intp]
+    quat_v: NDArray[np.intp]
+
+
+def _places(model: mujoco.MjModel) -> _Places:
     scalar_q: list[int] = []
     scalar_v: list[int] = []
     quat_q: list[int] = []
     quat_v: list[int] = []
     for joint in range(model.njnt):
-        iq, iv, kind = model.jnt_qposadr[joint], model.jnt_dofadr[joint], int(model.jnt_type[joint])
+        iq, iv, kind = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), int(model.jnt_type[joint])
         if kind == FREE:
             scalar_q += [iq, iq + 1, iq + 2]
             scalar_v += [iv, iv + 1, iv + 2]
             iq, iv = iq + 3, iv + 3
         if kind in (FREE, BALL):
-            quat_q.append(int(iq))
-            quat_v.append(int(iv))
+            quat_q.append(iq)
+            quat_v.append(iv)
         else:
-            scalar_q.append(int(iq))
-            scalar_v.append(int(iv))
-    return np.array(scalar_q, dtype=int), np.array(scalar_v, dtype=int), quat_q, quat_v
+            scalar_q.append(iq)
+            scalar_v.append(iv)
+    starts_q, starts_v = np.array(quat_q, dtype=np.intp), np.array(quat_v, dtype=np.intp)
+    return _Places(
+        np.array(scalar_q, dtype=np.intp),
+        np.array(scalar_v, dtype=np.intp),
+        starts_q[:, None] + np.arange(4),
+        starts_v[:, None] + np.arange(3),
+    )
+
+
+def _quaternion_rates(
+    quaternions: list[list[float]], spins: list[list[float]]
+) -> list[tuple[float, float, float, float]]:
+    """q * (0, w) / 2 of quaternions (n, 4) and angular velocities (n, 3); few: quicker than NumPy."""
+    out = []
+    for (w, x, y, z), (wx, wy, wz) in zip(quaternions, spins, strict=True):
+        p, r, s = 0.5 * wx, 0.5 * wy, 0.5 * wz
+        out.append(
+            (-x * p - y * r - z * s, w * p + y * s - z * r, w * r + z * p - x * s, w * s + x * r - y * p)
+        )
+    return out

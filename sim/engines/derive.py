@@ -12,6 +12,14 @@ from .interface import Array, Problem, Role, Segment
 from .prescribe import Prescriber
 from .timed import Timed
 
+_GIVEN = int(
+    mujoco.mjtState.mjSTATE_TIME
+    | mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_QVEL
+    | mujoco.mjtState.mjSTATE_ACT
+    | mujoco.mjtState.mjSTATE_CTRL
+)
+
 
 @dataclass(frozen=True)
 class Derived:
@@ -40,31 +48,37 @@ def _derive(problem: Problem, segment: Segment) -> Derived:
     m, n = problem.model, len(segment.t)
     p = Prescriber(m, problem.dofs(Role.KEYED))
     p.model.opt.timestep = problem.step
-    d, plain = mujoco.MjData(p.model), mujoco.MjData(m)
-    timed, friction = Timed(problem), dry_friction(m)[p.keyed]
+    d, timed, friction = mujoco.MjData(p.model), Timed(problem), dry_friction(m)[p.keyed]
     inputs = timed.at(segment.t)
-    a, tau, ctrl = np.zeros((n, m.nv)), np.zeros((n, m.nv)), np.zeros((n, m.nu))
-    kinetic, potential, normal = np.zeros(n), np.zeros(n), np.zeros(n)
-    tick = np.searchsorted(segment.tick_t, segment.t + 1e-9, side="right") - 1
+    tick = np.searchsorted(segment.tick_t, segment.t + 1e-9, side="right")  # 0: before the first
+    ctrl, qfrc = (np.vstack([np.zeros(x.shape[1]), x])[tick] for x in (segment.tick_ctrl, segment.tick_qfrc))
+    ctrl[:, timed.servos] = inputs.ctrl
+    states = np.column_stack([segment.t, segment.q, segment.v, segment.act, ctrl])
+    a, force, drive = np.zeros((n, m.nv)), np.zeros((n, m.nv)), np.zeros((n, len(p.keyed)))
+    energy, normal = np.zeros((2, n)), np.zeros(n)
     for i in range(n):
-        d.qpos[:], d.qvel[:], d.act[:], d.time = segment.q[i], segment.v[i], segment.act[i], segment.t[i]
-        held = tick[i] >= 0
-        d.ctrl[:] = segment.tick_ctrl[tick[i]] if held else 0.0
-        d.ctrl[timed.servos] = inputs.ctrl[i]
-        qfrc = segment.tick_qfrc[tick[i]] if held else np.zeros(m.nv)
-        ctrl[i] = d.ctrl
-        if segment.a is not None and segment.drive is not None:
+        mujoco.mj_setState(m, d, states[i], _GIVEN)
+        if segment.a is not None:
             mujoco.mj_fwdPosition(m, d)
             mujoco.mj_fwdVelocity(m, d)
             mujoco.mj_fwdActuation(m, d)
-            a[i], tau[i] = segment.a[i], d.qfrc_actuator + qfrc + segment.drive[i]
         else:
             apply_wrenches(p.model, d, timed, inputs.wrench[i])
-            p.settle(d, qfrc, inputs.a[i])
-            a[i], tau[i] = d.qacc, d.qfrc_actuator + qfrc
-            tau[i, p.keyed] = d.qfrc_actuator[p.keyed] + p.drive + friction * np.sign(segment.v[i, p.keyed])
-            normal[i] = _normal(p.model, d)
-        kinetic[i], potential[i] = _energy(m, plain, segment.q[i], segment.v[i])
+            p.settle(d, qfrc[i], inputs.a[i])
+            a[i], drive[i], normal[i] = d.qacc, p.drive, _normal(p.model, d)
+            if len(p.keyed):
+                mujoco.mj_makeM(m, d)  # without what makes them move as told
+        force[i] = d.qfrc_actuator
+        mujoco.mj_energyPos(m, d)
+        mujoco.mj_energyVel(m, d)
+        energy[:, i] = d.energy
+    tau = force + qfrc
+    if segment.a is not None:
+        assert segment.drive is not None
+        a, tau = segment.a, tau + segment.drive
+    else:
+        tau[:, p.keyed] = force[:, p.keyed] + drive + friction * np.sign(segment.v[:, p.keyed])
+    potential, kinetic = energy
     return Derived(a, tau, ctrl, kinetic, potential, normal)
 
 
@@ -81,26 +95,26 @@ def apply_wrenches(model: mujoco.MjModel, data: mujoco.MjData, timed: Timed, wre
         return
     if timed.body_frame.any():
         mujoco.mj_kinematics(model, data)
-    data.xfrc_applied[:] = 0.0
+    applied = data.xfrc_applied
+    applied[:] = 0.0
     for body, local, w in zip(timed.bodies, timed.body_frame, wrench, strict=True):
-        R_WB = data.xmat[body].reshape(3, 3) if local else np.eye(3)
-        data.xfrc_applied[body, :3] += R_WB @ w[:3]
-        data.xfrc_applied[body, 3:] += R_WB @ w[3:]
-
-
-def _energy(model: mujoco.MjModel, data: mujoco.MjData, q: Array, v: Array) -> tuple[float, float]:
-    data.qpos[:], data.qvel[:] = q, v
-    mujoco.mj_fwdPosition(model, data)
-    mujoco.mj_energyPos(model, data)
-    mujoco.mj_energyVel(model, data)
-    return float(data.energy[1]), float(data.energy[0])
+        if local:
+            R_WB = data.xmat[body].reshape(3, 3)
+            applied[body, :3] += R_WB @ w[:3]
+            applied[body, 3:] += R_WB @ w[3:]
+        else:
+            applied[body] += w
 
 
 def _normal(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Sum of the normal forces [N] of all contacts."""
-    total, force = 0.0, np.zeros(6)
-    for c in range(data.ncon):
-        if data.contact[c].efc_address >= 0:
-            mujoco.mj_contactForce(model, data, c, force)
-            total += float(force[0])
-    return total
+    """Sum of the normal forces [N] of all contacts.
+
+    That of a pyramid is the sum of its rows, that of a cone its first row (MuJoCo, Computation, Constraint
+    model); the rows of contacts come last.
+    """
+    if not data.ncon:
+        return 0.0
+    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return float(data.efc_force[data.ne + data.nf + data.nl :].sum())
+    rows = data.contact.efc_address
+    return float(data.efc_force[rows[rows >= 0]].sum())

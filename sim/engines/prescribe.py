@@ -57,9 +57,8 @@ class Prescriber:
         m.stat.meaninertia = mean_inertia
         self._inertial = np.zeros(m.nv)
 
-    def forward(self, data: mujoco.MjData, qfrc: Array, a_key: Array) -> None:
-        """``mj_forward`` with joint forces ``qfrc`` (nv,) and keyed accelerations ``a_key`` (k,)."""
-        data.qfrc_applied[:] = qfrc
+    def forward(self, data: mujoco.MjData, a_key: Array) -> None:
+        """``mj_forward`` with keyed accelerations ``a_key`` (k,) and the joint forces in ``qfrc_applied``."""
         if not len(self.keyed):
             mujoco.mj_forward(self.model, data)
             return
@@ -73,16 +72,23 @@ class Prescriber:
 
     def observe(self, data: mujoco.MjData) -> None:
         """Take ``drive`` from the accelerations and forces of an evaluation."""
-        k = self.keyed
-        mujoco.mj_mulM(self.model, data, self._inertial, data.qacc)
-        self.drive = (self._inertial[k] - self.armature * data.qacc[k]) + (
-            data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator - data.qfrc_constraint
-        )[k]
+        k, a = self.keyed, data.qacc
+        mujoco.mj_mulM(self.model, data, self._inertial, a)
+        others = data.qfrc_bias - data.qfrc_passive
+        others -= data.qfrc_actuator
+        others -= data.qfrc_constraint
+        self.drive = self._inertial[k] - self.armature * a[k]
+        self.drive += others[k]
 
     def settle(self, data: mujoco.MjData, qfrc: Array, a_key: Array) -> None:
-        """As :meth:`forward`, repeated until the keyed accelerations are met: afterwards ``drive`` (k,) is
-        the force [N, N m] that the keyed motion needs."""
+        """As :meth:`forward` under joint forces ``qfrc`` (nv,), until the keyed accelerations are met: then
+        ``drive`` (k,) is the force [N, N m] that the keyed motion needs."""
+        data.qfrc_applied[:] = qfrc
+        if not len(self.keyed):
+            self.forward(data, a_key)
+            return
+        allowed = 1e-12 * (1.0 + np.abs(a_key))
         for _ in range(4):
-            self.forward(data, qfrc, a_key)
-            if np.all(np.abs(data.qacc[self.keyed] - a_key) <= 1e-12 * (1.0 + np.abs(a_key))):
+            self.forward(data, a_key)
+            if (np.abs(data.qacc[self.keyed] - a_key) <= allowed).all():
                 break

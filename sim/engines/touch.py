@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
+
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from ...models import name_of
+from ...models import Kind, name_of
 from .interface import Event
 
-_JOINT_LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
-_TENDON_LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
+_LIMITS: dict[int, Kind] = {
+    int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT): "joint",
+    int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON): "tendon",
+}
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # the first of the kinds of contacts
 
 
 def can_touch(model: mujoco.MjModel) -> bool:
@@ -48,31 +52,35 @@ class Touch:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.model = model
         self.events: list[Event] = []
         self._now: set[tuple[str, str]] = set()
         self._seen = b""
+        self._limit, self._contact = cache(partial(_limit, model)), cache(partial(_contact, model))
 
     def look(self, data: mujoco.MjData, t: float) -> None:
         """Note what has begun and ended, after the last evaluation of the step that starts at ``t`` [s]."""
         if not (data.ncon or data.nl or self._now):
             return
-        force, kind, which = data.efc_force, data.efc_type, data.efc_id
-        pushing = np.flatnonzero(force)
+        pushing, kind, which = data.efc_force.astype(bool), data.efc_type, data.efc_id
         geoms = data.contact.geom
-        seen = b"".join((kind[pushing].tobytes(), which[pushing].tobytes(), geoms.tobytes()))
+        seen = b"".join((pushing.tobytes(), kind.tobytes(), which.tobytes(), geoms.tobytes()))
         if seen == self._seen:
             return
         self._seen = seen
-        rows = zip(kind[pushing].tolist(), which[pushing].tolist(), strict=True)
-        now = {self._what(k, i, geoms) for k, i in rows if k >= _JOINT_LIMIT}
+        rows, pairs = set(zip(kind[pushing].tolist(), which[pushing].tolist(), strict=True)), geoms.tolist()
+        now = {self._limit(k, i) for k, i in rows if k in _LIMITS}
+        now |= {self._contact(*pairs[i]) for k, i in rows if k >= _CONTACT}
         self.events += [Event(t, begun, what) for begun, what in sorted(now - self._now)]
         self.events += [Event(t, f"{ended} end", what) for ended, what in sorted(self._now - now)]
         self._now = now
 
-    def _what(self, kind: int, index: int, geoms: NDArray[np.int32]) -> tuple[str, str]:
-        """Kind and name of a row of MuJoCo's constraints: a limit's or a contact's."""
-        m = self.model
-        if kind in (_JOINT_LIMIT, _TENDON_LIMIT):
-            return "limit", name_of(m, "joint" if kind == _JOINT_LIMIT else "tendon", index)
-        return "contact", " - ".join(sorted(name_of(m, "body", int(m.geom_bodyid[g])) for g in geoms[index]))
+
+def _limit(model: mujoco.MjModel, kind: int, index: int) -> tuple[str, str]:
+    """Kind and name of the limit of a joint or tendon."""
+    return "limit", name_of(model, _LIMITS[kind], index)
+
+
+def _contact(model: mujoco.MjModel, *geoms: int) -> tuple[str, str]:
+    """Kind and name of a contact of two geoms."""
+    bodies = sorted(name_of(model, "body", int(model.geom_bodyid[g])) for g in geoms)
+    return "contact", " - ".join(bodies)
