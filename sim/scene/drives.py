@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...models import name_of
 from ..clip import Clip
 from ..control import is_position_servo, why_not_controllable
+from ..curves import Curve
 from ..engines.interface import Array, Drive, Role
 from ..kinds import SCALAR
 from .goals import Goals
@@ -93,6 +94,8 @@ def _on_joint(model: mujoco.MjModel, i: int) -> bool:
 
 def _servo_along_keys(model: mujoco.MjModel, clip: Clip, i: int) -> Callable[[Array], Array]:
     """Control of a position servo that follows its joint's keys: ctrl = gear q."""
-    column = int(model.jnt_qposadr[model.actuator_trnid[i, 0]])
-    gear = float(model.actuator_gear[i, 0])
-    return lambda t: np.asarray(gear * clip.evaluate(t).q[:, column])
+    joint, gear = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0])
+    track, rest = clip.tracks.get(name_of(model, "joint", joint)), float(clip.q0[model.jnt_qposadr[joint]])
+    if not isinstance(track, Curve):
+        return lambda t: np.full(np.shape(t), gear * rest)
+    return lambda t: np.asarray(gear * track(t).q[:, 0])
