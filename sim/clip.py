@@ -124,6 +124,10 @@ class Clip:
         """Times strictly between `t0` and `t1` where q, v or a of any channel jumps, all turns of loops."""
         return _union([channel.curve.breaks_between(t0, t1) for channel in self._channels])
 
+    def knots_between(self, t0: float, t1: float) -> Array:
+        """Times strictly between `t0` and `t1` where a piece of any channel ends, all turns of loops."""
+        return _union([channel.curve.knots_between(t0, t1) for channel in self._channels])
+
     @cached_property
     def _channels(self) -> tuple[_Channel, ...]:
         channels = []

@@ -142,14 +142,21 @@ class Curve(ABC):
 
     def breaks_between(self, t0: float, t1: float) -> Array:
         """Times strictly between `t0` and `t1` where q, v or a jumps, in every turn of a loop."""
+        return self._between(self.breaks, t0, t1)
+
+    def knots_between(self, t0: float, t1: float) -> Array:
+        """Times strictly between `t0` and `t1` where a piece ends, in every turn of a loop."""
+        return self._between(self.knots, t0, t1)
+
+    def _between(self, times: Array, t0: float, t1: float) -> Array:
         period = self.end - self.start
-        found = [self.breaks]
+        found = [times]
         if period > 0 and self.after == "loop":
             turns = range(1, int(np.ceil((t1 - self.start) / period)) + 1)
-            found += [self.breaks[self.breaks > self.start] + k * period for k in turns]
+            found += [times[times > self.start] + k * period for k in turns]
         if period > 0 and self.before == "loop":
             turns = range(int(np.floor((t0 - self.start) / period)) - 1, 0)
-            found += [self.breaks[self.breaks < self.end] + k * period for k in turns]
+            found += [times[times < self.end] + k * period for k in turns]
         every = np.unique(np.concatenate(found))
         return every[(every > t0) & (every < t1)]
 

@@ -433,6 +433,13 @@ def test_prescribed_motion_becomes_polynomials_that_agree_to_rounding():
     np.testing.assert_allclose(pieces(t), jumping(t), rtol=0, atol=1e-12)
     np.testing.assert_allclose(pieces([1.5], left=True), pieces([1.5]))
     # a jump on a boundary between halves
+    rng = np.random.default_rng(3)
+    spline = keyed(np.sort(rng.uniform(0, 4, 9)), rng.normal(size=(9, 2)), kind="natural", after="hold")
+    known = spline.knots_between(0.0, 4.0)
+    told = pieces_of(lambda t: spline(t).q, 2, 0.0, 4.0, spline.breaks_between(0.0, 4.0), known)
+    np.testing.assert_array_equal(told.knots, [0.0, *known, 4.0])
+    t = rng.uniform(0, 4, 99)
+    np.testing.assert_allclose(told(t), spline(t).q, atol=1e-12)
     sign = pieces_of(lambda t: np.sign(t - 1.5)[:, None], 1, 0.0, 3.0)
     assert sign.knots[sign.breaks].tolist() == [1.5]
     # a kink is a break as well, also on such a boundary

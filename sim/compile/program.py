@@ -198,7 +198,8 @@ class Program:
 class Bound:
     """A program on arrays of its own: write the inputs, call, read the outputs; nothing is allocated.
 
-    `inputs` and `outputs` are the arrays by name, shape (size,), or (count, size) for a batch.
+    `inputs` and `outputs` are the arrays by name, shape (size,), or (count, size) for a batch; `build` tells
+    how the program came to be.
     """
 
     def __init__(self, program: Program, count: int = 1):
@@ -207,6 +208,7 @@ class Bound:
         self.outputs = {name: np.zeros((*lead, size)) for name, size in program.outputs.items()}
         arguments = [x for array in self.inputs.values() for x in (address(array), array.shape[-1])]
         arguments += [address(array) for array in self.outputs.values()]
+        self.build = program.build
         self._program, self._function, self._arguments = program, program.function, (count, *arguments)
 
     def __call__(self) -> None:

@@ -121,8 +121,9 @@ class Compiled:
         """The prescribed motion as polynomials in time since the run's start, up to ``end``."""
         from ..dynamics.motion.adaptive import motion_of
 
-        breaks = self.timed.breaks(self.t0, self.t0 + end) - self.t0
-        return motion_of(self.smooth, self.at if self.nw else None, 0.0, end, breaks)
+        span = self.t0, self.t0 + end
+        breaks, knots = self.timed.breaks(*span) - self.t0, self.timed.knots(*span) - self.t0
+        return motion_of(self.smooth, self.at if self.nw else None, 0.0, end, breaks, knots)
 
     def guards(self, limits: Limits) -> Guards | None:
         """What steps of any length must not pass unseen: limits of free joints, the pull of those at rest."""

@@ -72,6 +72,13 @@ class Timed:
             found.append(np.array([t for t in (w.start, w.stop) if t0 < t < t1]))
         return np.unique(np.concatenate(found))
 
+    def knots(self, t0: float, t1: float) -> Array:
+        """Times strictly between ``t0`` and ``t1`` where pieces of a keyed motion or a wrench end."""
+        found = [self.clip.knots_between(t0, t1)]
+        for w in self.problem.wrenches:
+            found += [curve.knots_between(t0, t1) for curve in (w.force, w.torque) if curve is not None]
+        return np.unique(np.concatenate(found))
+
     def at(self, t: NDArray[np.floating], *, left: bool = False) -> TimedInputs:
         """Inputs at times ``t`` (n,) [s]; where keys bend, from the right, or from the ``left``."""
         times: Array = np.asarray(t, dtype=np.float64)

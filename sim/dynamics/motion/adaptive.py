@@ -49,15 +49,17 @@ def adaptive_loop(
     )  # fmt: skip
 
 
-def motion_of(smooth: Smooth, w: Prescribed, t0: float, t1: float, breaks: ArrayLike = ()) -> Pieces:
-    """The prescribed motion `w`, a row or a function of time, from t0 to t1."""
+def motion_of(
+    smooth: Smooth, w: Prescribed, t0: float, t1: float, breaks: ArrayLike = (), knots: ArrayLike = ()
+) -> Pieces:
+    """The prescribed motion `w`, a row or a function of time, from t0 to t1; see `pieces_of`."""
     size = smooth.layout.nw
     if w is None:
         if size:
             raise EngineError(NO_MOTION)
         return constant(np.zeros(0), t0, t1)
     if callable(w):
-        return pieces_of(w, size, t0, t1, breaks)
+        return pieces_of(w, size, t0, t1, breaks, knots)
     value = np.asarray(w, dtype=float)
     if value.shape != (size,):
         raise EngineError(

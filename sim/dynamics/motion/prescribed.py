@@ -70,15 +70,22 @@ def constant(value: Array, t0: float, t1: float) -> Pieces:
 
 
 def pieces_of(
-    motion: Callable[[Array], ArrayLike], width: int, t0: float, t1: float, breaks: ArrayLike = ()
+    motion: Callable[[Array], ArrayLike],
+    width: int,
+    t0: float,
+    t1: float,
+    breaks: ArrayLike = (),
+    knots: ArrayLike = (),
 ) -> Pieces:
     """`motion`, times (n,) -> (n, width), from t0 to t1 as polynomials that agree with it to rounding.
 
     Pieces are halved until their polynomials are resolved; where that never happens is a break, beside those
-    given. Raises EngineError for a motion of another shape, one that is not finite, or one that is too wild.
+    given. `knots`, where its own pieces are known to end, spare halving down to them. Raises EngineError for
+    a motion of another shape, one that is not finite, or one that is too wild.
     """
     given = np.unique(np.asarray(breaks, dtype=float))
-    ends = np.concatenate([[t0], given[(given > t0) & (given < t1)], [t1]])
+    inner = np.union1d(given, np.asarray(knots, dtype=float))
+    ends = np.concatenate([[t0], inner[(inner > t0) & (inner < t1)], [t1]])
     low, high = ends[:-1], ends[1:]
     done: list[tuple[Array, Array, Array]] = []
     largest = np.zeros(width)
