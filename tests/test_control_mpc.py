@@ -190,6 +190,10 @@ def test_steps_of_any_joints_beside_keyed_ones_are_the_engines_and_their_derivat
     path = pushed.rollout(x[:nq], x[nq:], u[None], step=h, steps=1, w=prescribed, t0=0.4)
     mine = shooting.advance(x, u, h, ref.w[0])
     np.testing.assert_allclose(mine, np.concatenate([path.q[-1], path.v[-1]]), atol=1e-7)
+    plan = shooting.begin(x, np.tile(u, (law.n, 1)), ref)
+    for k in range(law.n):
+        after = shooting.advance(plan.x[k], u, h, ref.w[k])
+        np.testing.assert_allclose(plan.x[k + 1], after, atol=1e-7)
     A, B = shooting.derivatives(x[None], u[None], Horizon(ref.x[:2], ref.u[:1], ref.h[:1], ref.w[:1]))
     for j, unit in enumerate(eps * np.eye(2 * n)):
         plus, minus = (shooting.advance(moved(x, s * unit), u, h, ref.w[0]) for s in (1, -1))

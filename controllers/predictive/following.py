@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.compile.cache import source
 from ...sim.compile.graph import Graph, Scalar, maximum, minimum
 from ...sim.compile.tape import Tape
 from ...sim.dynamics.laws import LawSizes, LinearFeedback
@@ -32,7 +33,7 @@ class Following(LinearFeedback):
     @property
     def key(self) -> str:
         """Which freedoms are driven."""
-        return f"following {self.inputs}"
+        return f"following {self.inputs} {source(__file__)}"
 
     def sizes(self, layout: Layout) -> LawSizes:
         """See :class:`~pantograph.sim.dynamics.laws.CompiledLaw`."""
