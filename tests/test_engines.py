@@ -349,6 +349,62 @@ class Counting:
         return Held(np.zeros(self.nu), np.full(self.nv, float(k % 3)))
 
 
+class Careless(Counting):
+    """Controls that write into the state that they are shown."""
+
+    def sample(self, k, t, q, v):
+        held = super().sample(k, t, q, v)
+        q[:], v[:] = np.nan, np.nan
+        return held
+
+
+def test_controls_may_write_into_what_they_are_shown():
+    scene = Scene(duration=0.1, rate=100, models=[{"file": "pendulum"}], solver={"step": 0.01})
+    problem = make_plan(scene).problem
+    one, two = (
+        ContactEngine().run(problem, (0.0, 0.1), kind(0.01, problem.model.nu, problem.model.nv))
+        for kind in (Counting, Careless)
+    )
+    np.testing.assert_array_equal(one.q, two.q)
+    np.testing.assert_array_equal(one.v, two.v)
+
+
+@pytest.mark.parametrize("far", [9.9e4, 1e7, 9e9])
+@pytest.mark.parametrize("integrator", ["rk4", "euler"])
+def test_far_away_is_no_divergence(far, integrator):
+    """Bodies whose coordinates are all below 1e10 run on, also where they are more than that together."""
+    pucks = [
+        {"name": f"puck{i}", "shape": "sphere", "size": [0.1], "position": [far, -far, far + 0.1 * i]}
+        for i in range(2)
+    ]
+    scene = Scene(
+        duration=0.05,
+        props=pucks,
+        physics={"gravity": False, "contacts": "none"},
+        solver={"engine": "contact", "integrator": integrator},
+    )
+    r = run(scene)
+    assert r.status == "done"
+    np.testing.assert_array_equal(r.q, np.broadcast_to(r.q[0], r.q.shape))
+
+
+@pytest.mark.parametrize("mode", ["plain", "pushed"])
+@pytest.mark.parametrize("far", [9.9e9, 2e10])
+def test_beyond_1e10_is_divergence(mode, far):
+    puck = {"name": "puck", "shape": "sphere", "size": [0.1], "position": [0, 0, 0]}
+    scene = Scene(
+        duration=1.0,
+        models=[{"file": "pendulum"}],
+        props=[puck],
+        physics={"gravity": False, "contacts": "none"},
+        forces=[{"body": "puck", "force": [0, 0, 0]}] if mode == "pushed" else [],
+        initial={"velocity": {"puck": [far, 0, 0, 0, 0, 0]}},
+        solver={"engine": "contact", "step": 0.01},
+    )
+    r = run(scene)
+    assert r.status == ("diverged" if far > 1e10 else "done")
+
+
 @pytest.mark.parametrize("step", [0.01, 0.005, 0.0025])
 @pytest.mark.parametrize("integrator", ["rk4", "euler"])
 def test_controls_are_sampled_at_their_period_and_held_whatever_the_step(step, integrator):
@@ -465,6 +521,29 @@ def test_actuators_do_what_their_drive_says(mode):
     if mode == "keys":
         np.testing.assert_allclose(r.ctrl[:, 2], plan.problem.clip.evaluate(r.t).q[:, elbow], atol=1e-12)
     assert abs(r.q[-1, elbow] - 0.8) < 0.05
+
+
+@pytest.mark.parametrize("curve", ["auto", "linear"])
+def test_a_servo_along_keys_is_commanded_where_the_clip_has_its_joint(curve):
+    """Also one whose joint has no keys: it is held where the joint is at first."""
+    scene = Scene(
+        duration=1.0,
+        models=[{"file": "arm6"}],
+        roles={"tracked": ["*"]},
+        keys=[
+            {"joint": "elbow", "times": [0, 0.3, 1], "values": [0.4, 0.1, 0.8], "curve": curve},
+            {"joint": "waist", "times": [0, 1], "values": [0.2, -0.8], "curve": curve},
+        ],
+        initial={"position": {"shoulder": 0.3}},
+        actuators={"*": "keys"},
+    )
+    problem = make_plan(scene).problem
+    m, t = problem.model, np.linspace(-0.1, 1.2, 27)
+    q = problem.clip.evaluate(t).q
+    assert sorted(problem.servo) == list(range(m.nu))
+    for i, command in problem.servo.items():
+        column = m.jnt_qposadr[m.actuator_trnid[i, 0]]
+        np.testing.assert_array_equal(command(t), m.actuator_gear[i, 0] * q[:, column])
 
 
 def test_roles_split_every_dof_exactly_once():

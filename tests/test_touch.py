@@ -1,11 +1,14 @@
 """Contacts and limits as events of a run: seen at every step, whatever the samples."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pantograph.sim import Scene, make_plan, run
+from pantograph.sim.engines.touch import Touch
 
 FLOOR = {"name": "floor", "shape": "plane", "size": [3, 3], "fixed": True}
 G = 9.81
@@ -92,3 +95,71 @@ def test_a_tendon_at_its_limit_is_an_event(tmp_path):
     fall = np.sqrt(2 * 0.4 / G)
     assert (r.events[0].kind, r.events[0].what) == ("limit", "rope")
     assert r.events[0].t == pytest.approx(fall, abs=0.003)
+
+
+NAMED = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+  <body name="a"><joint name="j0"/><geom size=".1"/><site name="s"/>
+    <body name="b"><joint name="j1"/><geom size=".1"/><geom size=".2"/></body></body></worldbody>
+  <tendon><fixed name="t0"><joint joint="j0" coef="1"/></fixed><fixed name="t1"><joint joint="j1" coef="1"/>
+  </fixed></tendon></mujoco>"""
+KINDS = mujoco.mjtConstraint
+LIMITED = {
+    (KINDS.mjCNSTR_LIMIT_JOINT, 0): "j0",
+    (KINDS.mjCNSTR_LIMIT_JOINT, 1): "j1",
+    (KINDS.mjCNSTR_LIMIT_TENDON, 0): "t0",
+    (KINDS.mjCNSTR_LIMIT_TENDON, 1): "t1",
+}
+GEOMS = {(0, 1): "a - world", (0, 2): "b - world", (3, 0): "b - world", (1, 3): "a - b"}
+rows = st.floats(-1.0, 1.0) | st.just(0.0)
+
+
+@st.composite
+def evaluations(draw):
+    """Constraints as MuJoCo lists them (dry friction, limits, contacts), and what of them pushes."""
+    friction = draw(st.lists(rows, max_size=2))
+    limits = draw(st.lists(st.tuples(st.sampled_from([*LIMITED]), rows), max_size=2))
+    contacts = draw(st.lists(st.tuples(st.sampled_from([*GEOMS]), st.lists(rows, max_size=4)), max_size=3))
+    kind = [int(KINDS.mjCNSTR_FRICTION_DOF)] * len(friction) + [int(k) for (k, _), _ in limits]
+    which = [*range(len(friction)), *(i for (_, i), _ in limits)]
+    force = [*friction, *(f for _, f in limits)]
+    for i, (_, forces) in enumerate(contacts):
+        kind += [int(KINDS.mjCNSTR_CONTACT_PYRAMIDAL)] * len(forces)
+        which += [i] * len(forces)
+        force += forces
+    data = SimpleNamespace(
+        ncon=len(contacts),
+        nl=len(limits),
+        efc_type=np.array(kind, dtype=np.int32),
+        efc_id=np.array(which, dtype=np.int32),
+        efc_force=np.array(force, dtype=float),
+        contact=SimpleNamespace(geom=np.array([g for g, _ in contacts], dtype=np.int32).reshape(-1, 2)),
+    )
+    pushing = {("limit", LIMITED[what]) for what, f in limits if f}
+    return data, pushing | {("contact", GEOMS[g]) for g, forces in contacts if any(forces)}
+
+
+@given(st.lists(evaluations(), max_size=8))
+@settings(max_examples=300)
+def test_events_are_the_changes_of_what_pushes_whatever_the_constraints(steps):
+    touch, expected, before = Touch(mujoco.MjModel.from_xml_string(NAMED)), [], set()
+    for t, (data, now) in enumerate(steps):
+        touch.look(data, float(t))
+        expected += [(float(t), *e) for e in sorted(now - before)]
+        expected += [(float(t), f"{kind} end", what) for kind, what in sorted(before - now)]
+        before = now
+    assert [(e.t, e.kind, e.what) for e in touch.events] == expected
+
+
+@pytest.mark.parametrize("kinds", ["mjCNSTR_LIMIT_JOINT mjCNSTR_LIMIT_TENDON", "mjCNSTR_LIMIT_TENDON " * 2])
+@pytest.mark.parametrize("ids", [(0, 0), (0, 1), (1, 1)])
+def test_a_limit_that_takes_over_from_another_is_an_event(kinds, ids):
+    touch, names = Touch(mujoco.MjModel.from_xml_string(NAMED)), []
+    for kind, i in zip(kinds.split(), ids, strict=True):
+        names.append(LIMITED[getattr(KINDS, kind), i])
+        arrays = {"efc_type": [int(getattr(KINDS, kind))], "efc_id": [i], "efc_force": [1.0]}
+        contact = SimpleNamespace(geom=np.zeros((0, 2), dtype=np.int32))
+        data = {name: np.array(x) for name, x in arrays.items()}
+        touch.look(SimpleNamespace(ncon=0, nl=1, contact=contact, **data), 0.0)
+    found = [(e.kind, e.what) for e in touch.events]
+    changed = [("limit", names[1]), ("limit end", names[0])] if names[0] != names[1] else []
+    assert found == [("limit", names[0]), *changed]
