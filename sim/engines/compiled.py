@@ -72,7 +72,8 @@ class Compiled:
 
     def held(self, held: Held) -> Array:
         """Held controls and joint forces, of one time or of many, as the compiled model takes them."""
-        return np.concatenate([held.ctrl[..., self.u_held], held.qfrc[..., self.v_free]], axis=-1)
+        own = held.ctrl[..., self.u_held] if len(self.u_held) else held.ctrl[..., :0]
+        return np.concatenate([own, held.qfrc if self.whole else held.qfrc[..., self.v_free]], axis=-1)
 
     def controlled(self, law: CompiledLaw, gains: Array) -> ControlledStepper:
         """Steps in which ``law`` with ``gains`` is sampled."""

@@ -103,7 +103,8 @@ class Limits:
 
     def _far(self, q: Array, v: Array, step: float) -> bool:
         """Whether no limit can be suspect: all are farther than any joint comes in a step and back."""
-        return bool(self.gaps(q).min() > 2.0 * step * max(v.max(), -v.min()))
+        least, speed = np.minimum.reduce(self.gaps(q), None), np.maximum.reduce(np.abs(v), None)
+        return bool(least > 2.0 * step * speed)
 
     def near(
         self, q0: Array, v0: Array, q1: Array, v1: Array, step: float, resting: tuple[Limit, ...]
@@ -115,12 +116,12 @@ class Limits:
         found = np.flatnonzero(self.suspect(np.stack([q0, q1]), np.stack([v0, v1]), step)[0])
         return [self.each[i] for i in found if self.each[i].joint not in still]
 
-    def doubtful(self, q: Array, v: Array, step: float, resting: tuple[Limit, ...]) -> NDArray[np.bool_]:
-        """Whether each of n steps between states q (n + 1, nq) passes a limit, or may."""
-        if not self.each:
-            return np.zeros(len(q) - 1, dtype=bool)
-        if self._far(q, v, step):
-            return np.zeros(len(q) - 1, dtype=bool)
+    def doubtful(
+        self, q: Array, v: Array, step: float, resting: tuple[Limit, ...]
+    ) -> NDArray[np.bool_] | None:
+        """Whether each of n steps between states q (n + 1, nq) passes a limit, or may; None if none does."""
+        if not self.each or self._far(q, v, step):
+            return None
         found = self.suspect(q, v, step)
         still = {limit.joint for limit in resting}
         found[:, [i for i, limit in enumerate(self.each) if limit.joint in still]] = False

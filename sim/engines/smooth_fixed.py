@@ -132,6 +132,9 @@ class FixedRun(Run):
     def _first_doubtful(self, k: int, q: Array, v: Array, act: Array) -> int:
         """Index of the last state before a limit is passed, or may be, or has to pull a joint at rest."""
         doubtful = self.limits.doubtful(q, v, self.h, self.resting)
+        if doubtful is None and not self.resting:
+            return len(q) - 1
+        doubtful = np.zeros(len(q) - 1, dtype=bool) if doubtful is None else doubtful
         if self.resting:
             offsets: Array = self.h * np.arange(k + 1.0, k + len(q))
             doubtful |= (self.forces_at(offsets, q[1:], v[1:], act[1:]) < 0).any(axis=1)
