@@ -466,6 +466,31 @@ def test_both_engines_make_the_same_loop_where_nothing_touches():
     np.testing.assert_allclose(same, K, rtol=1e-5, atol=1e-5)
 
 
+def test_both_engines_make_the_same_loop_of_an_arm_that_holds_its_weight():
+    """Its forces count: inertia changes with the pose, and with it what they do."""
+    keys = [{"joint": j, "times": [0], "values": [x]} for j, x in (("shoulder", 0.3), ("elbow", 1.1))]
+
+    def loop(engine):
+        scene = Scene(
+            duration=0.1,
+            models=[{"file": "planar_2r"}],
+            roles={"tracked": ["shoulder", "elbow"]},
+            actuators={"*": "off"},
+            keys=keys,
+            physics={"limits": False},
+            controller={"law": "computed-torque", "period": 0.01},
+            solver={"engine": engine},
+        )
+        return loop_of(make_plan(scene), "computed-torque", {})
+
+    exact, theirs = loop("smooth"), loop("contact")
+    assert "exact" in exact.says
+    assert "differences" in theirs.says
+    np.testing.assert_allclose(theirs.system.A, exact.system.A, atol=1e-6)
+    np.testing.assert_allclose(theirs.system.B, exact.system.B, atol=1e-6)
+    np.testing.assert_allclose(theirs.K, exact.K, rtol=1e-4, atol=1e-3)
+
+
 PRESS = """<mujoco><option timestep="1e-4"/><worldbody><geom type="plane" size="1 1 .1"/>
   <body name="foot" pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1" damping="30"/>
   <geom type="sphere" size=".1" mass="1" solref="0.05 1"/></body></worldbody></mujoco>"""
