@@ -71,16 +71,16 @@ def test_energies_are_those_of_the_model_whatever_is_keyed(case):
 @given(segments())
 @settings(max_examples=20)
 def test_a_sample_is_derived_from_itself_alone(case):
-    """Samples in reverse have the same accelerations, forces and energies."""
+    """Samples in reverse have the same accelerations, forces and energies: keyed joints do as told in all."""
     problem, segment = case
     back = dataclasses.replace(segment, q=segment.q[::-1].copy(), v=segment.v[::-1].copy())
     one, two = derive(problem, segment), derive(problem, back)
-    for name in ("a", "tau", "kinetic", "potential"):
+    for name, tolerance in (("a", 1e-9), ("tau", 1e-7), ("kinetic", 0.0), ("potential", 0.0)):
         x, y = getattr(one, name), getattr(two, name)[::-1]
-        np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6 * (1.0 + np.abs(x).max(initial=0.0)))
+        np.testing.assert_allclose(x, y, rtol=1e-12, atol=tolerance * (1.0 + np.abs(x).max(initial=0.0)))
 
 
-BOXES = """<mujoco><option cone="{cone}" timestep="0.002"/><worldbody>
+BOXES = """<mujoco><option cone="{cone}" timestep="0.002" gravity="2 0 -9.81"/><worldbody>
   <geom type="plane" size="3 3 .1" condim="{condim}"/>
   <body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1" mass="3" condim="{condim}"/></body>
   <body pos="1 0 .1"><freejoint/><geom type="sphere" size=".1" mass="2" condim="1"/></body>
@@ -93,7 +93,8 @@ BOXES = """<mujoco><option cone="{cone}" timestep="0.002"/><worldbody>
 @pytest.mark.parametrize("condim", [1, 3, 4, 6])
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_normal_forces_carry_what_rests_on_the_floor_and_nothing_else(tmp_path, cone, condim):
-    """A box and a ball at rest, while a ball falls, a limit holds a weight, and dry friction acts."""
+    """A box that friction holds and a ball that slides, while a ball falls, a limit holds a weight and dry
+    friction acts."""
     path = tmp_path / "boxes.xml"
     path.write_text(BOXES.format(cone=cone, condim=condim))
     r = run(Scene(duration=0.55, models=[{"file": str(path)}], solver={"integrator": "implicitfast"}))

@@ -495,6 +495,38 @@ def test_warnings_of_mujoco_do_not_reach_the_working_folder(tmp_path, monkeypatc
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
+def test_an_acceleration_beyond_1e10_is_divergence_before_the_state_is(tmp_path):
+    file = tmp_path / "fall.xml"
+    file.write_text("""
+<mujoco><option gravity="0 0 -2e10"/><worldbody>
+  <body><joint name="calm" type="slide" axis="1 0 0"/><geom size="0.1" contype="0" conaffinity="0"/></body>
+  <body><joint name="fall" type="slide" axis="0 0 1"/><geom size="0.1" contype="0" conaffinity="0"/></body>
+</worldbody></mujoco>""")
+    solver = {"engine": "contact", "integrator": "euler", "step": 1e-3}
+    r = run(Scene(duration=0.01, models=[{"file": str(file)}], solver=solver))
+    assert r.status == "diverged"
+    assert "'fall'" in r.message
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "euler"])
+def test_activation_under_a_keyed_command_follows_its_filter(tmp_path, integrator):
+    """act' = (ctrl - act) / T from rest with ctrl = 1: the force is 1 - exp(-t / T) (MuJoCo: Actuation)."""
+    file = tmp_path / "filter.xml"
+    file.write_text("""
+<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="push" type="slide"/>
+  <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><general name="lag" joint="push" dyntype="filter" dynprm="0.2"/></actuator></mujoco>""")
+    scene = Scene(
+        duration=1.0,
+        models=[{"file": str(file)}],
+        keys=[{"actuator": "lag", "times": [0], "values": [1]}],
+        solver={"engine": "contact", "integrator": integrator, "step": 1e-3},
+    )
+    r = run(scene)
+    tolerance = 1e-10 if integrator == "rk4" else 2e-3  # h / (2 e T)
+    np.testing.assert_allclose(r.tau[:, 0], 1 - np.exp(-r.t / 0.2), atol=tolerance)
+
+
 @pytest.mark.parametrize("mode", ["controller", "keys", "off"])
 def test_actuators_do_what_their_drive_says(mode):
     """arm6: its own position servos off, along the keys, or as the controller wants."""

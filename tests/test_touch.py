@@ -163,3 +163,18 @@ def test_a_limit_that_takes_over_from_another_is_an_event(kinds, ids):
     found = [(e.kind, e.what) for e in touch.events]
     changed = [("limit", names[1]), ("limit end", names[0])] if names[0] != names[1] else []
     assert found == [("limit", names[0]), *changed]
+
+
+def test_a_contact_that_takes_over_from_another_is_an_event():
+    touch = Touch(mujoco.MjModel.from_xml_string(NAMED))
+    for geoms in ((0, 1), (0, 2), (3, 0)):
+        rows = {
+            "efc_type": np.array([int(KINDS.mjCNSTR_CONTACT_FRICTIONLESS)]),
+            "efc_id": np.array([0]),
+            "efc_force": np.array([1.0]),
+        }
+        touch.look(
+            SimpleNamespace(ncon=1, nl=0, contact=SimpleNamespace(geom=np.array([geoms])), **rows), 0.0
+        )
+    found = [(e.kind, e.what) for e in touch.events]
+    assert found == [("contact", "a - world"), ("contact", "b - world"), ("contact end", "a - world")]
