@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 from ..sim.control import Law, Sampled, Target
 from ..sim.engines.common import Broken
@@ -145,6 +144,8 @@ def learn(
     and drives. A repeat that diverges is the last one.
     Raises PantographError for parameters that make no sense.
     """
+    from scipy.signal import butter, sosfiltfilt
+
     ticks = int(np.ceil(problem.duration / period - 1e-9))
     if positive("share", share) > 1.0:
         raise PantographError(f"share must be at most 1, all of the feedback, got {share!r}")
