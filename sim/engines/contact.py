@@ -85,7 +85,8 @@ class _Run:
         self.jumps = self.timed.jumps(self.t0, self.h, self.steps)
         self.held = Held(np.zeros(self.model.nu), np.zeros(self.model.nv))
         self.joints = _places(self.model)
-        self.width = self.model.nq + self.model.nv + self.model.na
+        self.nq, self.nqv = self.model.nq, self.model.nq + self.model.nv  # where parts of a state end
+        self.width = self.nqv + self.model.na
         self.touch = Touch(self.model)
         self.k = 0  # the step to come
         self.torn: tuple[int, Array] | None = None  # a step that has begun, and the state before it
@@ -261,12 +262,12 @@ class _Run:
 
     def _rate(self, out: Array) -> None:
         """Write the time derivative of the state (nq + nv + na,), after an evaluation there."""
-        d, m, j = self.data, self.model, self.joints
+        d, j = self.data, self.joints
         out[j.scalar_q] = d.qvel[j.scalar_v]
         if len(j.quat_q):
             out[j.quat_q] = _quaternion_rates(d.qpos[j.quat_q].tolist(), d.qvel[j.quat_v].tolist())
-        out[m.nq : m.nq + m.nv] = d.qacc
-        out[m.nq + m.nv :] = d.act_dot
+        out[self.nq : self.nqv] = d.qacc
+        out[self.nqv :] = d.act_dot
 
     def _state(self) -> Array:
         """The state (nq + nv + na,): q, v, act."""
@@ -275,8 +276,7 @@ class _Run:
         return x
 
     def _parts(self, x: Array) -> State:
-        nq, nv = self.model.nq, self.model.nv
-        return State(x[:nq], x[nq : nq + nv], x[nq + nv :])
+        return State(x[: self.nq], x[self.nq : self.nqv], x[self.nqv :])
 
     def _nonsense(self, k: int, x: Array) -> str:
         """Why the state ``x`` at step ``k`` makes no sense, or an empty string."""
