@@ -9,14 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.clip import Clip
 from ..sim.control import Law, Target
+from ..sim.errors import PantographError
 from ..sim.kinds import SCALAR
 from .drives import Drives
-from .gains import Gain, choice, felt_inertia, per_joint, positive
+from .gains import Gain, choice, felt_inertia, per_joint, positive, switch
 from .ilc import Fed, load_learned
 from .nominal import difference
 from .observers import Kalman, Observer, VelocityFilter
 from .play import Play, Rotors
+from .predictor import Predictor
 
 Array = NDArray[np.float64]
 OBSERVERS = ("none", "filter", "kalman", "extended")
@@ -47,7 +50,8 @@ class Loop:
       ``noise`` [rad, m] (default: what the encoder rounds away, or 1e-4) and accelerations that the model
       does not know being about ``push`` [rad/s^2, m/s^2]. It knows what motors were told to give, not what
       play and friction leave of it; joints ``keyed`` (nv,) are known to be where their keys say;
-    - ``delay`` [s]: forces take effect that much later, rounded up to whole periods;
+    - ``delay`` [s]: forces take effect that much later, rounded up to whole periods; with ``predict`` the law
+      is asked for the moment when they do, at the state that its model foresees then;
     - ``saturation``: forces are cut at this fraction of what the drives can give;
     - ``top_speed`` [rad/s, m/s]: motor force falls linearly to zero at this joint speed;
     - ``play`` [rad, m]: full width of the play of the gears between motors and joints, see
@@ -68,6 +72,7 @@ class Loop:
         q0: Array,
         period: float,
         keyed: NDArray[np.bool_] | None = None,
+        clip: Clip | None = None,
         *,
         encoder: float = 0.0,
         backlash: Gain = 0.0,
@@ -76,6 +81,7 @@ class Loop:
         noise: Gain | None = None,
         push: Gain = 5.0,
         delay: float = 0.0,
+        predict: bool = False,
         saturation: float | None = None,
         top_speed: Gain | None = None,
         play: Gain = 0.0,
@@ -104,6 +110,13 @@ class Loop:
         for joint in np.unique(model.dof_jntid[self.keyed]):
             ends = (*model.jnt_qposadr, model.nq)
             self.keyed_q[ends[joint] : ends[joint + 1]] = True
+        self.predictor: Predictor | None = None
+        if switch("predict", predict) and self.late:
+            if learned:
+                raise PantographError("predict: learned forces know the delay already; leave one of them out")
+            known = Clip(model, {}, q0) if clip is None else clip
+            self.predictor = Predictor(model, self.keyed, known, period, self.late, self.drives)
+        self.ahead = self.late * period
         self.observer: Observer | None = None
         positive("corner", corner)
         if observer == "filter":
@@ -146,6 +159,10 @@ class Loop:
         if self.observer is not None:
             seen = self.observer.update(seen, t, y, memory.applied, target if self._any_keyed else None)
             q_seen, v_seen = seen.q, np.where(self.keyed, target.v, seen.v) if self._any_keyed else seen.v
+        if self.predictor is not None:
+            target = self.predictor.target(t, target)
+            q_seen, v_seen = self.predictor.state(t, q_seen, v_seen, memory.queue)
+            t += self.ahead
         tau, inner = self.law(t, q_seen, v_seen, target, memory.law)
         queue, rotors = (*memory.queue, tau), memory.rotors
         given, cut = self._drive(queue[0], v)
@@ -182,8 +199,8 @@ class Loop:
 
 
 LOOP_WORDS = (
-    "encoder", "backlash", "observer", "corner", "noise", "push", "delay", "saturation", "top_speed", "play",
-    "friction", "stiction", "learned",
+    "encoder", "backlash", "observer", "corner", "noise", "push", "delay", "predict", "saturation",
+    "top_speed", "play", "friction", "stiction", "learned",
 )  # fmt: skip
 
 
@@ -195,6 +212,7 @@ def with_reality(
     period: float,
     words: Mapping[str, Any],
     keyed: NDArray[np.bool_] | None = None,
+    clip: Clip | None = None,
 ) -> Law:
     """``law`` inside a :class:`Loop` when any of ``words`` asks for one."""
-    return Loop(law, model, tracked, q0, period, keyed, **words) if words else law
+    return Loop(law, model, tracked, q0, period, keyed, clip, **words) if words else law

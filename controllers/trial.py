@@ -173,11 +173,12 @@ def _learned(plan: Plan, true: Problem, words: Mapping[str, Any], period: float)
     own = {word: x for word, x in words.items() if word not in ILC_WORDS and word not in LOOP_WORDS}
     real = {word: x for word, x in words.items() if word in LOOP_WORDS}
     tracked = problem.dofs(Role.TRACKED)
+    if real.get("predict"):
+        raise PantographError("predict: what learns knows the delay already; leave it out")
 
     def around(law: Law) -> Law:
-        return with_reality(
-            law, problem.model, tracked, problem.state0.q, period, real, problem.dofs(Role.KEYED)
-        )
+        start, keyed = problem.state0.q, problem.dofs(Role.KEYED)
+        return with_reality(law, problem.model, tracked, start, period, real, keyed, problem.clip)
 
     def law() -> Law:
         return make_law(base, problem, own, period)

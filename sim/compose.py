@@ -85,9 +85,8 @@ def make_law(
         drives = Drives(believed, offered["tracked"], reality.get("saturation"), offered["top_speed"])
         offered["model"] = drives.told(believed)
         law = factory(*(offered[word] for word in needed), **own)
-        return with_reality(
-            law, believed, offered["tracked"], problem.state0.q, period, reality, offered["keyed"]
-        )
+        tracked, keyed = offered["tracked"], offered["keyed"]
+        return with_reality(law, believed, tracked, problem.state0.q, period, reality, keyed, problem.clip)
     except (TypeError, PantographError) as e:
         raise SceneError(str(e)) from e
 

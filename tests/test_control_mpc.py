@@ -252,6 +252,34 @@ def test_a_plan_is_followed_as_its_steps_do_one_by_one(seed):
             np.testing.assert_allclose(X[k + 1], shooting.advance(X[k], U[k], ref.h[k], ref.w[k]), atol=1e-9)
 
 
+@given(seeds)
+@settings(max_examples=6)
+def test_a_plan_that_comes_true_goes_on_as_it_was(seed):
+    """Within a step of its grid and across one."""
+    law, rng = CART, np.random.default_rng(seed)
+    x = 0.3 * rng.normal(size=4)
+    _, memory = law(0.0, x[:2], x[2:], STILL, law.start())
+    plan, shooting = memory.plan, law.shooting
+    for t, passed in ((0.02, 0), (0.04, 1)):
+        at = plan.x[passed]
+        reached = shooting.advance(at, plan.u[passed], t - passed * law.step, np.zeros((3, 0)))
+        goes_on = law.carried(reached, law.horizon(t), t, memory)
+        kept = law.n - passed
+        # the rest of a step after a part of it is another RK4 than the whole step
+        np.testing.assert_allclose(goes_on.u[:kept], plan.u[passed:], atol=5e-3)
+
+
+def test_steps_that_end_at_a_key_end_with_the_motion_before_it():
+    model = ball_and_free()
+    held = model.dof_jntid == 0
+    clip = Clip(model, {"table": keyed([0, 0.3, 1], [0, 1.2, -0.2], kind="linear")}, model.qpos0)
+    law = NMPC(model, ~held, model.qpos0, clip, 0.1, held, step=0.1, horizon=0.3)
+    w = law.horizon(0.2).w  # (steps, places, position, speed and acceleration)
+    np.testing.assert_allclose(w[0, :, 1], 4.0)
+    np.testing.assert_allclose(w[1, :, 1], -2.0)
+    np.testing.assert_allclose(w[0, 2, 0], 1.2)
+
+
 def test_noise_does_not_drive_the_plan_off():
     """An unstable machine seen through a coarse encoder, one improvement a sample: its plan is carried on
     with its gains. Without these, the open-loop motion from each noisy state flies off."""

@@ -35,3 +35,49 @@ def test_a_task_moves_as_wanted_beside_passive_and_keyed_joints(law, roles):
     a, free = np.where(told, target.a, 0.0), ~told
     a[free] = np.linalg.solve(M[np.ix_(free, free)], (tau - bias - M @ a)[free])
     np.testing.assert_allclose(now.J @ a + now.drift, expected, rtol=1e-4, atol=1e-3)
+
+
+def _still(law, v):
+    """What a law of the arm's tip adds at joint speeds v, small, where it is wanted at rest here, to what
+    makes up for the joints' own damping."""
+    model, every = load_model("arm6"), np.ones(6, dtype=bool)
+    q, nothing = np.array([0.3, 0.35, 0.15, 0.2, 1.05, 0.1]), np.zeros(6)
+    made = law(model, every, model.qpos0)
+    target = Target(q, nothing, nothing)
+    added = made(0.0, q, v, target, None)[0] - made(0.0, q, nothing, target, None)[0]
+    added -= Nominal(model).inverse(q, v, nothing) - Nominal(model).weight(q)
+    return Nominal(model).mass_matrix(q), Task(model, "tip", "position").at(q, nothing).J, added
+
+
+@pytest.mark.parametrize("damping", [0.4, 1.0])
+def test_every_mode_of_an_impedance_has_its_damping(damping):
+    """Poles of L e'' + D e' + K e = 0, with the damper D as the law's forces show it."""
+
+    def law(model, every, q0):
+        return Impedance(model, every, q0, site="tip", stiffness=300.0, damping=damping)
+
+    rng, eps, D = np.random.default_rng(0), 1e-6, np.zeros((3, 3))
+    rates, forces = np.zeros((2, 3, 3))
+    for k in range(3):
+        v = eps * rng.normal(size=6)
+        M, J, tau = _still(law, v)
+        inertia = np.linalg.inv(J @ np.linalg.solve(M, J.T))
+        rates[:, k], forces[:, k] = J @ v, -inertia @ J @ np.linalg.solve(M, tau)
+    D = forces @ np.linalg.inv(rates)
+    inverse = np.linalg.inv(inertia)
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-300.0 * inverse, -inverse @ D]])
+    poles = np.linalg.eigvals(A)
+    np.testing.assert_allclose(-poles.real / np.abs(poles), damping, rtol=1e-2)
+
+
+@pytest.mark.parametrize("kind", [Impedance, OperationalSpace])
+def test_what_the_task_leaves_comes_to_rest_critically_damped(kind):
+    """Speeds that the site does not feel: a = -2 w v at the posture's w."""
+
+    def law(model, every, q0):
+        return kind(model, every, q0, site="tip", posture=1.5)
+
+    _, J, _ = _still(law, np.zeros(6))
+    for v in 1e-6 * np.linalg.svd(J)[2][3:]:
+        M, _, tau = _still(law, v)
+        np.testing.assert_allclose(np.linalg.solve(M, tau), -4.0 * np.pi * 1.5 * v, rtol=1e-3, atol=1e-9)

@@ -18,7 +18,7 @@ from ...sim.plan import Plan
 from ...sim.scene.angles import law_words
 from ..nominal import Nominal, moved
 from ..preview import aimed
-from ..reality import LOOP_WORDS
+from ..reality import LOOP_WORDS, LoopMemory
 from .linear import LinearSystem, held, linearise, linearise_contact
 from .memory import LinearLaw, linear_law, numbers
 
@@ -93,8 +93,11 @@ def loop_of(
 
 def _on_keys(problem: Problem, law: Law, own: Mapping[str, Any], t: float, period: float) -> _Point:
     clip, _ = aimed(problem.clip, own.get("goal") or {}, "goal")
-    before, target = (Target(*clip.evaluate(max(0.0, at))) for at in (t - period, t))
-    _, memory = law(t - period, before.q, before.v, before, law.start())
+    memory = law.start()
+    target = Target(*clip.evaluate(t))
+    for k in range(len(memory.queue) + 1 if isinstance(memory, LoopMemory) else 1, 0, -1):
+        before = Target(*clip.evaluate(max(0.0, t - k * period)))
+        _, memory = law(t - k * period, before.q, before.v, before, memory)
     return _Point(t, target.q, target.v, target, memory)
 
 
@@ -115,7 +118,9 @@ def _run_to(plan: Plan, law: Law, t: float) -> _Point:
 
 def _left(words: Mapping[str, Any]) -> tuple[str, ...]:
     """Words of sensors and drives that are no part of the linear loop."""
-    kept = {"delay"} | ({"observer", "corner"} if words.get("observer") in ("none", "filter") else set())
+    kept = {"delay", "predict"} | (
+        {"observer", "corner"} if words.get("observer") in ("none", "filter") else set()
+    )
     return tuple(word for word in words if word in LOOP_WORDS and word not in kept)
 
 
