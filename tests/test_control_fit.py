@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pantograph.controllers.fit import Phase, check, machine, retime
 from pantograph.controllers.fit.check import follow, forces
+from pantograph.controllers.fit.timing.halfspaces import needed
 from pantograph.models import load_model
 from pantograph.sim import PantographError
 from pantograph.sim.clip import Clip, Motion
@@ -268,6 +269,30 @@ def test_a_hairpin_is_no_stop():
     assert found.slowed < 1.03
     straight = retime(Clip(ARM, {"shoulder": tracks["shoulder"]}, ARM.qpos0), able, points=400)
     assert found.duration == pytest.approx(straight.duration, rel=0.1)
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_limits_left_out_follow_from_those_that_stay(seed):
+    """The largest of any direction is the same with all rows and with the needed ones; some are equal, one
+    hardly differs, some ask for nothing, and one coordinate may be far larger."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(3, 20, 3)) * [1.0, 10.0 ** rng.uniform(-6, 6), 1.0]
+    rows = np.concatenate([rows, -rows, rows[:, :5], 0.999 * rows[:, :3], np.zeros((3, 2, 3))], axis=1)
+    positive = (False, bool(seed % 2), True)
+    kept = needed(rows, positive)
+    assert kept.sum() < 0.7 * kept.size
+    ends = [(0.0 if p else None, None) for p in positive]
+    for at, mine in zip(rows, kept, strict=True):
+        unit = np.abs(at).max(axis=0)
+        for way in rng.normal(size=(5, 3)):
+            each = [
+                linprog(-way, A_ub=a / unit, b_ub=np.ones(len(a)), bounds=ends, method="highs")
+                for a in (at, at[mine])
+            ]
+            assert each[0].status == each[1].status
+            if each[0].status == 0:
+                assert each[1].fun == pytest.approx(each[0].fun, rel=1e-7)
 
 
 @given(seeds)

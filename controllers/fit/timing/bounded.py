@@ -18,6 +18,7 @@ from ....sim.clip import Clip, Motion
 from ....sim.errors import PantographError
 from ..machine import Machine
 from ..watch import interruptible, watch
+from .halfspaces import needed
 from .path import Path
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ def fastest(
     ipopt: dict[str, Any] = {"print_level": 0, "sb": "yes", "max_iter": 400, "tol": 1e-7}
     # what is left of lengths is divided by the cube of times where jerk is judged
     ipopt |= {"constr_viol_tol": 1e-11}
+    ipopt |= {"mu_init": 1.0 if known is None else 1e-3}
     ipopt |= {"acceptable_tol": 1e-4, "acceptable_obj_change_tol": 1e-6, "acceptable_constr_viol_tol": 1e-11}
     options = {"print_time": False, "error_on_fail": False, "ipopt": ipopt, "iteration_callback": guard}
     solver = ca.nlpsol("timing", "ipopt", {"x": z, "f": 100.0 * ca.sum1(dt) / seconds, "g": g}, options)
@@ -127,16 +129,19 @@ def _conditions(
         (along.end, along.begin, along.third[1], r1, u1),
     )
     for at, other, bend, v, a in sides:
-        for x, y, c, e in zip(*(part.T for part in rows(at, other)), strict=True):
-            size = np.maximum(np.abs(c), 1e-9)
-            below.append((x / size) * a + (y / size) * v**2 + (e / size) * v - c / size)
-        for dof in np.flatnonzero(np.isfinite(machine.jerk)):
-            parts = (at.v[:, dof], 3.0 * at.a[:, dof], bend[:, dof])
-            if max(np.abs(part).max() for part in parts) == 0.0:
-                continue
-            one, two, three = (part / machine.jerk[dof] for part in parts)
-            jerk = one * j + two * v * a + three * v**3
-            below += [jerk - 1.0, -jerk - 1.0]
+        x, y, c, e = rows(at, other)
+        size = np.maximum(np.abs(c), 1e-9)
+        forces = np.stack([x / size, y / size, e / size], axis=2)
+        room = c / size
+        mine = needed(np.where((room > 0.5)[:, :, None], forces, np.inf), (False, True, True))
+        k, (one, two, three) = np.nonzero(mine)[0].tolist(), forces[mine].T
+        below.append(one * a[k] + two * v[k] ** 2 + three * v[k] - room[mine])
+        limit = machine.jerk
+        jerk = np.stack([at.v / limit, 3.0 * at.a / limit, bend / limit], axis=2)
+        jerk = np.concatenate([jerk, -jerk], axis=1)
+        mine = needed(jerk, (False, False, True))
+        k, (one, two, three) = np.nonzero(mine)[0].tolist(), jerk[mine].T
+        below.append(one * j[k] + two * v[k] * a[k] + three * v[k] ** 3 - 1.0)
     return equal, below
 
 

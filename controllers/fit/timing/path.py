@@ -90,7 +90,7 @@ def corners(
     """All corners between the ends of a clip whose freedoms ``jerky`` (nv,) have a limit on jerk; ``still``
     are the times between which nothing moves. With ``keep`` the rests of the keys are stops as well."""
     breaks = clip.breaks_between(clip.start, clip.end)
-    at = np.union1d(breaks, _rests(clip))
+    at = np.union1d(breaks, _rests(clip, slowest(clip)))
     for a, b in still:
         at = at[(at < a) | (at > b)]
     edges = np.unique([t for ends in still for t in ends if clip.start < t < clip.end])
@@ -144,7 +144,7 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _slowest(clip: Clip) -> Array:
+def slowest(clip: Clip) -> Array:
     """Times between breaks at which the keyed motion is slowest for a moment."""
     edges = np.concatenate([[clip.start], clip.breaks_between(clip.start, clip.end), [clip.end]])
     found = [np.zeros(0)]
@@ -202,7 +202,7 @@ def uneven(clip: Clip, still: list[tuple[float, float]], *, keep: bool) -> bool:
     return not np.isin(through, stops).all()
 
 
-def _rests(clip: Clip) -> Array:
+def _rests(clip: Clip, slowest: Array) -> Array:
     """Times at which everything rests: knots, where that is eased into, and what lies between."""
     span = clip.end - clip.start
     top = np.abs(clip.evaluate(np.linspace(clip.start, clip.end, 501)).v).max()
@@ -211,7 +211,7 @@ def _rests(clip: Clip) -> Array:
         s = s[(s > clip.start + 1e-9 * span) & (s < clip.end - 1e-9 * span)]
         return np.asarray(s[np.abs(clip.evaluate(s).v).max(axis=1, initial=0.0) <= _REST * top])
 
-    at, other = still(knots(clip)), still(_slowest(clip))
+    at, other = still(knots(clip)), still(slowest)
     near = np.min(np.abs(other[:, None] - at), axis=1, initial=np.inf)
     return np.union1d(at, other[near > 1e-3 * span])
 
@@ -226,9 +226,10 @@ def stretches(
     ]
 
 
-def measure(clip: Clip, start: float, stop: float, found: list[Corner]) -> Measure:
-    """The p of a stretch from ``start`` to ``stop`` [s] with the corners ``found``."""
-    s, known = _slowest(clip), np.unique([start, stop, *(c.s for c in found), *_rests(clip)])
+def measure(clip: Clip, start: float, stop: float, found: list[Corner], slowest: Array) -> Measure:
+    """The p of a stretch from ``start`` to ``stop`` [s] with the corners ``found`` and the times at which the
+    clip is :func:`slowest`."""
+    s, known = slowest, np.unique([start, stop, *(c.s for c in found), *_rests(clip, slowest)])
     inner = known[(known >= start) & (known <= stop)]
     s = s[(s > start) & (s < stop)]
     room = np.min(np.abs(s[:, None] - inner), axis=1)

@@ -14,7 +14,7 @@ from ..check import by_piece
 from ..machine import Machine
 from .bounded import Timed, fastest, motion
 from .grid import Grid
-from .path import Corner, Measure, corners, even_nodes, measure, path, reversals, stretches
+from .path import Corner, Measure, corners, even_nodes, measure, path, reversals, slowest, stretches
 
 Array = NDArray[np.float64]
 _ROUNDS, _NEAR = 6, 1.002  # of cutting pieces, until limits hold to this between nodes
@@ -86,6 +86,7 @@ def _stretches(
     points: int,
 ) -> list[_Stretch]:
     parts, turns = stretches(clip, found, pauses), reversals(clip, machine.rubs)
+    slow = slowest(clip)
     total = sum(b - a for a, b, moves in parts if moves)
     ends = clip.evaluate(clip.start).v, clip.evaluate(clip.end, left=True).v
     first, last = (float(np.sqrt(x[k]) * np.linalg.norm(ends[k])) for k in (0, -1))
@@ -99,7 +100,7 @@ def _stretches(
             0.0 if at_rest or b < clip.end else last,
         )
         many = max(24, round(points * (b - a) / total))
-        by = measure(clip, a, b, found)
+        by = measure(clip, a, b, found, slow)
         by = by._replace(edges=np.union1d(by.edges, turns[(turns > a) & (turns < b)]))
         rows.append(_Stretch(even_nodes(clip, by, many), speeds, by))
     return rows
