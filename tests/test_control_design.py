@@ -267,6 +267,84 @@ def test_controllability_agrees_with_kalmans_rank_whatever_the_coordinates(seed)
     assert controllability(system(A[:3, :3], B[:3]))
 
 
+def mechanism(M, K, D, driven):
+    """M a + D v + K q = forces at the joints ``driven``, as a linear system."""
+    n, names = len(M), tuple(f"j{i}" for i in range(len(M)))
+    inverse = np.linalg.inv(M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ K, -inverse @ D]])
+    B = np.vstack([np.zeros((n, len(driven))), inverse[:, driven]])
+    inputs = tuple(names[i] for i in driven)
+    return LinearSystem(A, B, (*names, *(f"{name} rate" for name in names)), inputs)
+
+
+def positive_matrix(rng, n):
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.3 * np.eye(n)
+
+
+@pytest.mark.parametrize("period", [None, 0.01, 1e-4])
+@given(seeds, st.integers(2, 5), st.booleans(), st.booleans())
+@settings(max_examples=30)
+def test_a_base_in_free_fall_is_named_not_what_drives_it(period, seed, n, springs, damped):
+    """No force inside moves the centre of mass: the joint that only the world could push is named, twice at
+    zero, whatever the inertias are and also where other joints drift as freely."""
+    rng = np.random.default_rng(seed)
+    base = int(rng.integers(n))
+    driven = [i for i in range(n) if i != base]
+    inner = np.ix_(driven, driven)
+    K, D = np.zeros((n, n)), np.zeros((n, n))
+    K[inner] = positive_matrix(rng, n - 1) if springs else 0.0
+    D[inner] = positive_matrix(rng, n - 1) if damped else 0.0
+    s = mechanism(positive_matrix(rng, n), K, D, driven)
+    s = s if period is None else held(s, period)
+    verdict = controllability(s)
+    assert [m.of for m in verdict.modes] == [f"j{base}"] * 2
+    assert [m.frequency for m in verdict.modes] == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert not stabilisability(s)
+    assert f"no input moves j{base} (" in stabilisability(s).says
+    with pytest.raises(PantographError, match=f"no input can steer .*j{base}"):
+        (lqr if period is None else dlqr)(s.A, s.B, np.eye(2 * n), np.eye(n - 1), states=s.states)
+
+
+@given(seeds, st.integers(1, 3), st.integers(1, 3))
+@settings(max_examples=30)
+def test_all_joints_that_take_part_in_what_nothing_moves_are_named(seed, apart, together):
+    """Loose joints that hang together beside a driven machine: each mode is one of all of them."""
+    rng = np.random.default_rng(seed)
+    n = apart + together
+    order = rng.permutation(n)
+    M = linalg.block_diag(positive_matrix(rng, apart), positive_matrix(rng, together))
+    K = linalg.block_diag(positive_matrix(rng, apart), positive_matrix(rng, together))
+    where = np.argsort(order)
+    ours = [int(where[i]) for i in range(apart)]
+    s = held(mechanism(*(x[np.ix_(order, order)] for x in (M, K, 0.1 * K)), ours), 0.005)
+    verdict = controllability(s)
+    loose = ", ".join(sorted(f"j{where[i]}" for i in range(apart, n)))
+    assert len(verdict.modes) == 2 * together
+    assert {m.of for m in verdict.modes} == {loose}
+    C = np.eye(2 * n)[ours]
+    assert {m.of for m in observability(s, C).modes} == {loose}
+
+
+def test_equal_pendulums_on_a_driven_cart_swing_against_each_other():
+    """Only their sum pushes the cart: their difference is out of its reach, and moves no cart."""
+    M = np.array([[3.0, 0.5, 0.5], [0.5, 1.0, 0.0], [0.5, 0.0, 1.0]])
+    s = mechanism(M, np.diag([0.0, 9.81, 9.81]), np.zeros((3, 3)), [0])
+    verdict = controllability(s)
+    assert verdict.says == "not controllable by j0: they cannot move j1, j2 (3.13 rad/s)"
+    assert [m.frequency for m in verdict.modes] == pytest.approx([np.sqrt(9.81)] * 2)
+
+
+def test_a_loose_body_is_named_as_one(tmp_path):
+    (tmp_path / "two.xml").write_text(
+        """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1" pos="0 0 -1"/></body>
+        <body name="ball" pos="2 0 0"><freejoint name="ball"/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    m = mujoco.MjModel.from_xml_path(str(tmp_path / "two.xml"))
+    s = linearise(m, m.qpos0, inputs=np.arange(m.nv) == 0)
+    assert controllability(s).says == "not controllable by hinge: they cannot move ball (0 rad/s)"
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

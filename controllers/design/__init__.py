@@ -5,19 +5,16 @@ from .analysis import (
     Mode,
     StepInfo,
     closed_loop,
-    controllability,
-    detectability,
     growth,
     loop_response,
     margins,
     modes,
-    observability,
     root_locus,
-    stabilisability,
     step_info,
     step_response,
 )
 from .linear import LinearSystem, held, held_matrices, linearise, linearise_contact, linearise_path
+from .reach import controllability, detectability, observability, stabilisability
 from .riccati import Regulator, along, dlqr, finite_horizon, lqr
 
 __all__ = [

@@ -1,8 +1,8 @@
-"""What a linear loop is worth: modes, controllability, margins, step response figures, root locus."""
+"""What a linear loop is worth: modes, margins, step response figures, root locus."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,6 @@ from .linear import LinearSystem
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-_RANK = 1e-9  # singular values below this fraction of the largest count as zero
 _EDGE = 1e-9  # poles so near the edge of stability lie on it
 _SPLIT = 1e-7  # rounding splits double poles by about so much
 
@@ -20,7 +19,7 @@ _SPLIT = 1e-7  # rounding splits double poles by about so much
 @dataclass(frozen=True)
 class Mode:
     """A pole, with its natural ``frequency`` [rad/s] and ``damping`` ratio (of a discrete pole: of the
-    continuous one it samples; NaN without a period), whether it dies out, and ``of`` which state mostly."""
+    continuous one it samples; NaN without a period), whether it dies out, and ``of`` which states."""
 
     pole: complex
     frequency: float
@@ -44,11 +43,12 @@ class Mode:
 def modes(A: ArrayLike, *, period: float | None = None) -> tuple[Mode, ...]:
     """Modes of dx/dt = A x, or of x+ = A x with a ``period`` [s], slowest first."""
     poles = np.asarray(linalg.eigvals(np.asarray(A, dtype=float)), dtype=complex)
-    found = [_mode(complex(p), discrete=period is not None, period=period) for p in poles]
+    found = [mode_of(complex(p), discrete=period is not None, period=period) for p in poles]
     return tuple(sorted(found, key=lambda m: (m.frequency, m.pole.imag)))
 
 
-def _mode(pole: complex, *, discrete: bool, period: float | None = None) -> Mode:
+def mode_of(pole: complex, *, discrete: bool, period: float | None = None) -> Mode:
+    """The mode of a pole, of dx/dt = A x or, ``discrete``, of x+ = A x."""
     if not discrete:
         size = abs(pole)
         return Mode(pole, size, -pole.real / size if size else 1.0, pole.real < -_EDGE * min(size, 1.0))
@@ -57,98 +57,6 @@ def _mode(pole: complex, *, discrete: bool, period: float | None = None) -> Mode
         return Mode(pole, np.nan, np.nan, stable)
     s = np.log(pole) / period
     return Mode(pole, abs(s), -s.real / abs(s) if s else 1.0, stable)
-
-
-def unsteerable_modes(
-    A: Array,
-    B: Array,
-    *,
-    discrete: bool = False,
-    period: float | None = None,
-    states: tuple[str, ...] = (),
-) -> tuple[Mode, ...]:
-    """Modes that no input moves, by the test of Popov, Belevitch, Hautus: rank (A - p I, B) < n. With names
-    of ``states``, positions first, each says where it is seen most.
-
-    Repeated poles that rounding splits are judged as one: the test uses every pole with a tolerance.
-    """
-    n = len(A)
-    scale = max(float(np.linalg.norm(A, 2)), 1e-300)
-    unit = B / max(float(np.linalg.norm(B, 2)), 1e-300) * scale
-    found = []
-    for pole in linalg.eigvals(A):
-        left, sizes, _ = np.linalg.svd(np.hstack([A - pole * np.eye(n), unit]))
-        if sizes[-1] <= _RANK * scale:
-            mode = _mode(complex(pole), discrete=discrete or period is not None, period=period)
-            most = int(np.argmax(np.abs(left[:, -1]) * (np.arange(n) < n // 2 if states else 1.0)))
-            found.append(replace(mode, of=states[most]) if states else mode)
-    return tuple(found)
-
-
-def hidden_modes(
-    A: Array,
-    C: Array,
-    *,
-    discrete: bool = False,
-    period: float | None = None,
-    states: tuple[str, ...] = (),
-) -> tuple[Mode, ...]:
-    """Modes that no output C x shows: the unsteerable ones of the dual system."""
-    return unsteerable_modes(A.T, C.T, discrete=discrete, period=period, states=states)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a property holds, the modes it fails for, and a sentence."""
-
-    holds: bool
-    modes: tuple[Mode, ...]
-    says: str
-
-    def __bool__(self) -> bool:
-        return self.holds
-
-
-def controllability(system: LinearSystem) -> Verdict:
-    """Whether the inputs can move every mode."""
-    stuck = unsteerable_modes(system.A, system.B, period=system.period, states=system.states)
-    by = ", ".join(system.inputs)
-    return _verdict("controllable", f" by {by}", stuck, f"not controllable by {by}: they cannot move ")
-
-
-def stabilisability(system: LinearSystem) -> Verdict:
-    """Whether the inputs can move every mode that does not die out by itself."""
-    stuck = unsteerable_modes(system.A, system.B, period=system.period, states=system.states)
-    more = ": what no input moves dies out" if stuck else ""
-    return _verdict("stabilisable", more, _lasting(stuck), "not stabilisable: no input moves ")
-
-
-def observability(system: LinearSystem, C: ArrayLike) -> Verdict:
-    """Whether outputs C x (o, n) show every mode."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period, states=system.states)
-    return _verdict("observable", "", unseen, "not observable: nothing measured shows ")
-
-
-def detectability(system: LinearSystem, C: ArrayLike) -> Verdict:
-    """Whether outputs C x (o, n) show every mode that does not die out by itself."""
-    unseen = hidden_modes(system.A, np.asarray(C, dtype=float), period=system.period, states=system.states)
-    more = ": what nothing shows dies out" if unseen else ""
-    return _verdict("detectable", more, _lasting(unseen), "not detectable: nothing measured shows ")
-
-
-def _lasting(modes: tuple[Mode, ...]) -> tuple[Mode, ...]:
-    return tuple(m for m in modes if not m.stable)
-
-
-def _verdict(word: str, more: str, failing: tuple[Mode, ...], otherwise: str) -> Verdict:
-    if not failing:
-        return Verdict(True, (), f"{word}{more}")
-    groups: dict[str, list[str]] = {}
-    for mode in failing:
-        if mode.pole.imag >= 0.0:  # one of each pair
-            groups.setdefault(mode.of, []).append(f"{mode.frequency:.3g}")
-    said = ", ".join(f"{of} ({', '.join(rates)} rad/s)" for of, rates in groups.items())
-    return Verdict(False, failing, otherwise + said)
 
 
 def closed_loop(system: LinearSystem, K: ArrayLike) -> LinearSystem:

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from ...sim.errors import PantographError
-from .analysis import Mode, hidden_modes, unsteerable_modes
+from .analysis import Mode
+from .reach import hidden_modes, unsteerable_modes
 
 Array = NDArray[np.float64]
 
