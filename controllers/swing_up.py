@@ -28,23 +28,26 @@ _ARRIVED, _OFF = 1e12, 1e9  # arrivals are better than any value, whatever cross
 _CATCHING = 2.0  # seconds that a corrected motion has after its nearest point to be caught
 _ALONE = 1.0  # seconds at least without the catch for machines that it would lose
 _WELL_IN = 0.1  # of the catch's level: a machine that it has brought there is home
+_AS_FORESEEN = 0.01  # rad, m, and per second: a machine so near to where it was foreseen needs no new look
 
 
 class Intent(NamedTuple):
     """What a batch of machines (b,) is about to do: gains by their index; forces added to theirs in equal
-    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided (b,) [ticks]; and
-    whether the catch waits until these forces are through (b,)."""
+    stretches of time (b, s) and the length of a stretch (b,) [ticks]; when it was decided (b,) [ticks];
+    whether the catch waits until these forces are through (b,); and the states (b, looks, 2 n) in which the
+    next looks ahead will find it on its way home, NaN where none is known."""
 
     choice: NDArray[np.intp]
     extra: Array
     stretch: Array
     begun: Array
     alone: Mask
+    marks: Array
 
     def of(self, rows: NDArray[np.intp] | Mask) -> Intent:
         """Those of some machines, as arrays of their own."""
         first = (self.choice[rows], self.extra[rows], self.stretch[rows])
-        return Intent(*first, self.begun[rows], self.alone[rows])
+        return Intent(*first, self.begun[rows], self.alone[rows], self.marks[rows])
 
     def put(self, rows: NDArray[np.intp] | Mask, other: Intent) -> None:
         """Overwrite those of some machines."""
@@ -66,12 +69,13 @@ class SwingUp:
     """Brings a machine with one driven joint to its highest equilibrium, or to ``goal`` [rad, m] (joint ->
     value).
 
-    ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, every
-    ``every`` [s] until the catch has the machine; zero foresight takes the first set. Joints
+    ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, and again every
+    ``every`` [s] until the catch has the machine, unless it is on its way home as foreseen; zero foresight
+    takes the first set. Joints
     that have a range must stay in it with ``room`` [rad, m] to spare. Hinges count modulo a turn.
-    Keys of the driven joint play no part. Looking ahead takes far longer than a sample (the control bench
-    tells how long): it is planned outside real time. Raises PantographError when the machine has not exactly
-    one driven joint, or no such goal.
+    Keys of the driven joint play no part. A look ahead takes far longer than a sample (the control bench
+    tells how long); the last answer is kept, so that one who asks once before a run has the first one in
+    time. Raises PantographError when the machine has not exactly one driven joint, or no such goal.
     """
 
     def __init__(
@@ -94,6 +98,8 @@ class SwingUp:
         self.nominal, self.a, self.tries, self.seed = self.shaping.nominal, self.shaping.a, tries, seed
         self.low, self.high = self.shaping.low, self.shaping.high
         self.foresight, self.every = positive("foresight", foresight, zero=True), positive("every", every)
+        self._answer: tuple[tuple[object, ...], Intent] | None = None
+        self.looks = max(1, int(self.foresight / self.every))
         self.room = per_joint(model, "room", room, missing=0.05)
 
     # ---- the law, on a batch of machines q, v (b, n)
@@ -123,17 +129,20 @@ class SwingUp:
         tick: int,
         machine: NDArray[np.intp],
         until: Array | float = np.inf,
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array]:
         """What comes ``until`` (b,) ticks later of intentions (b,), several for each ``machine`` (b,): ticks
         until the catch has brought it well into its basin (infinite: another of the machine's is quicker, a
         limit is crossed, or it does not), the least value on the way (much more where a limit is crossed),
-        and ticks until then."""
+        ticks until then, and the states at the next looks ahead (b, looks, 2 n)."""
         b, (_, level) = len(q), self.shaping.catch
         until = np.broadcast_to(until, b)
         home, least, when = np.full(b, np.inf), np.full(b, np.inf), np.zeros(b)
+        marks, look = np.full((b, self.looks, 2 * q.shape[1]), np.nan), round(self.every / self.period)
         rows, caught, inside = np.arange(b), np.zeros(b, dtype=bool), np.ones(b, dtype=bool)
         done = np.zeros(int(machine.max(initial=0)) + 1, dtype=bool)
         for k in range(int(self.foresight / self.period)):
+            if k and k % look == 0:
+                marks[rows, k // look - 1] = np.hstack([q, v])
             tau, caught, value = self.force(q, v, intent, tick + k, caught)
             near = inside & (value < least[rows])
             least[rows[near]], when[rows[near]] = value[near], k
@@ -149,7 +158,7 @@ class SwingUp:
                     break
                 q, v, intent = q[keep], v[keep], intent.of(keep)
                 rows, caught, inside = rows[keep], caught[keep], inside[keep]
-        return home, least, when
+        return home, least, when, marks
 
     def intend(self, q: Array, v: Array, tick: int, before: Intent) -> Intent:
         """For each machine (b,) what brings it home first in simulation: one of the gains, or what it was
@@ -161,11 +170,13 @@ class SwingUp:
         gains = self._plain(np.tile(np.arange(k), b), tick)
         many = Intent(*(np.concatenate(pair) for pair in zip(gains, before, strict=True)))
         machine = np.concatenate([np.repeat(np.arange(b), k), np.arange(b)])
-        home, least, when = self.foresee(q[machine], v[machine], many, tick, machine)
+        home, least, when, marks = self.foresee(q[machine], v[machine], many, tick, machine)
         best, out = home[: b * k].reshape(b, k).argmin(axis=1), before.of(np.arange(b))
-        first = home[np.arange(b) * k + best]
+        place = np.arange(b) * k + best
+        first = home[place]
         better = first < home[b * k :]
         out.put(better, self._plain(best[better], tick))
+        out.marks[:] = np.where(better[:, None, None], marks[place], marks[b * k :])
         lost = np.flatnonzero(~np.isfinite(np.minimum(first, home[b * k :])))
         if len(lost):
             near = np.argsort(least[: b * k].reshape(b, k)[lost], axis=1)[:, :_BRANCHES]
@@ -176,7 +187,8 @@ class SwingUp:
     def _plain(self, choice: NDArray[np.intp], tick: int) -> Intent:
         b = len(choice)
         none = np.zeros(b, dtype=bool)
-        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)), none)
+        marks = np.full((b, self.looks, 2 * self.model.nv), np.nan)
+        return Intent(choice, np.zeros((b, _PARTS)), np.ones(b), np.full(b, float(tick)), none, marks)
 
     def _held(self, q: Array, v: Array) -> Mask:
         """Whether the catch would have machines (b,) now."""
@@ -202,14 +214,16 @@ class SwingUp:
             extra = mean[:, None] + spread[:, None] * noise
             extra[:, 0] = mean
             many = best.of(sample)._replace(extra=extra.reshape(b * c * p, -1))
-            home, least, _ = self.foresee(q[machine], v[machine], many, tick, machine, until)
+            home, least, _, marks = self.foresee(q[machine], v[machine], many, tick, machine, until)
             points = np.where(np.isfinite(home), home - _ARRIVED, least).reshape(b * c, p)
             order = np.argsort(points, axis=1)[:, : max(4, p // 8)]
             elite = np.take_along_axis(extra, order[:, :, None], axis=1)
             mean, spread = elite.mean(axis=1), elite.std(axis=1) + 1e-3 * limit
+            marks = np.where(np.isfinite(home)[:, None, None], marks, np.nan)  # others want another look
             now = points[rows, order[:, 0]] < score
             score = np.where(now, points[rows, order[:, 0]], score)
             best.extra[now] = extra[rows, order[:, 0]][now]
+            best.marks[now] = marks.reshape(b * c, p, *marks.shape[1:])[rows, order[:, 0]][now]
             if (score.reshape(b, c).min(axis=1) < 0.0).all():
                 break
         return best.of(np.arange(b) * c + score.reshape(b, c).argmin(axis=1))
@@ -233,12 +247,24 @@ class SwingUp:
         """Forces (b, nv) for a batch of machines q, v (b, n), one sample a period."""
         intent, caught, tick, again = memory
         if tick >= again:
-            away, again = np.flatnonzero(~caught), tick + round(self.every / self.period)
+            again = tick + round(self.every / self.period)
+            kept = (np.abs(intent.marks[:, 0] - np.hstack([q, v])) < _AS_FORESEEN).all(axis=1)
+            intent = intent.of(np.arange(len(q)))
+            intent.marks[:] = np.concatenate(
+                [intent.marks[:, 1:], np.full_like(intent.marks[:, :1], np.nan)], 1
+            )
+            away = np.flatnonzero(~caught & ~kept)
             if len(away):
-                intent = intent.of(np.arange(len(q)))
-                intent.put(away, self.intend(q[away], v[away], tick, intent.of(away)))
+                intent.put(away, self._intended(q[away], v[away], tick, intent.of(away)))
         tau, caught, _ = self.force(q, v, intent, tick, caught)
         return tau, SwingMemory(intent, caught, tick + 1, again)
+
+    def _intended(self, q: Array, v: Array, tick: int, before: Intent) -> Intent:
+        """:meth:`intend`, the last answer kept: who asks before a run has it when the run begins."""
+        asked = (tick, *(x.tobytes() for x in (q, v, *before)))
+        if self._answer is None or self._answer[0] != asked:
+            self._answer = asked, self.intend(q, v, tick, before)
+        return self._answer[1]
 
     # ---- the law on one machine
 

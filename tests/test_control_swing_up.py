@@ -182,7 +182,7 @@ def test_what_is_foreseen_comes_true():
     law, rng = ACROBOT, np.random.default_rng(8)
     q, v = rng.uniform(-np.pi, np.pi, (4, 2)), rng.uniform(-1, 1, (4, 2))
     intent = law.intend(q, v, 0, law.begin(4).intent)
-    home, _, _ = law.foresee(q, v, intent, 0, np.arange(4))
+    home, _, _, _ = law.foresee(q, v, intent, 0, np.arange(4))
     foreseen = np.isfinite(home)
     assert foreseen.sum() >= 2
     q, v, intent, home = q[foreseen], v[foreseen], intent.of(foreseen), home[foreseen]
@@ -193,6 +193,46 @@ def test_what_is_foreseen_comes_true():
         q, v = advance(law.nominal, q, v, tau, law.period / 8, 8)
     np.testing.assert_allclose(first, home, atol=30)
     assert np.abs(law.shaping.catch[0].state(q, v)[:, :2]).max() < 0.5
+
+
+def looks_of(law, monkeypatch):
+    """Ticks at which a law looks ahead, in a list that goes on growing."""
+    seen, intend = [], law.intend
+
+    def watched(q, v, tick, before):
+        seen.append(tick)
+        return intend(q, v, tick, before)
+
+    monkeypatch.setattr(law, "intend", watched)
+    return seen
+
+
+@pytest.mark.parametrize("kick", [0.0, 0.5])
+def test_a_machine_on_its_way_as_foreseen_needs_no_new_look(kick, monkeypatch):
+    """In another integration of the motion; one that was pushed off its way is looked at again."""
+    law = cart_law(foresight=6.0, tries=24, every=0.5)
+    looks = looks_of(law, monkeypatch)
+    q, v, memory = np.array([[0.0, np.pi - 0.1]]), np.zeros((1, 2)), law.begin(1)
+    for tick in range(600):
+        tau, memory = law.batch(q, v, memory)
+        q, v = advance(law.nominal, q, v, tau, 0.001, 10)
+        if tick == 70:
+            v = v + kick
+    assert memory.caught.all()
+    assert looks[: 1 + bool(kick)] == ([0, 100] if kick else [0])
+    if not kick:
+        assert looks == [0]
+
+
+def test_what_was_asked_before_a_run_is_known_when_it_begins(monkeypatch):
+    law = cart_law(foresight=6.0, tries=24)
+    looks = looks_of(law, monkeypatch)
+    q, v = np.array([0.0, 3.0]), np.zeros(2)
+    forces = [law(0.0, q, v, None, law.start())[0] for _ in range(3)]
+    assert looks == [0]
+    np.testing.assert_array_equal(forces[0], forces[2])
+    law(0.0, q + 0.01, v, None, law.start())
+    assert looks == [0, 0]
 
 
 def test_the_basin_of_a_double_pole_lies_around_upright():
