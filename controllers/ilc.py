@@ -9,7 +9,7 @@ Control Systems Magazine 26, 2006).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +17,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.compile.cache import key_of, source
 from ..sim.control import Law, Sampled, Target
 from ..sim.engines.common import Broken
 from ..sim.engines.interface import Engine, Problem, Role
 from ..sim.errors import PantographError
+from ..sim.formula import Expressed, Formula, Symbols
 from .gains import positive, whole
 from .nominal import difference
 
@@ -48,6 +50,25 @@ class Fed:
         """Joint forces (nv,); see :class:`~pantograph.sim.control.Law`."""
         tau, memory = self.law(t, q, v, target, memory)
         return tau + self.learned[min(round(t / self.period), len(self.learned) - 1)], memory
+
+    def formula(self, period: float) -> Formula | None:
+        """See :class:`~pantograph.sim.formula.Formula`; None around a law that has none."""
+        make = getattr(self.law, "formula", None)
+        inner: Formula | None = None if make is None else make(period)
+        if inner is None:
+            return None
+        nv = self.learned.shape[1]
+
+        def rows(first: int, targets: Target) -> Array:
+            ticks = np.minimum(np.arange(first, first + len(targets.q)), len(self.learned) - 1)
+            return np.hstack([self.learned[ticks], inner.rows(first, targets)])
+
+        def express(q: Symbols, v: Symbols, row: Symbols, gains: Symbols, memory: Symbols) -> Expressed:
+            tau, after = inner.express(q, v, row[nv:], gains, memory)
+            return [x + more for x, more in zip(tau, row[:nv], strict=True)], after
+
+        key = key_of(source(__file__), inner.key)
+        return replace(inner, key=key, width=nv + inner.width, rows=rows, express=express)
 
 
 class Repeated:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from ..sim.clip import Clip
 from ..sim.control import Law, Target
 from ..sim.errors import PantographError
+from ..sim.formula import Formula
 from ..sim.kinds import SCALAR
 from .drives import Drives
 from .gains import Gain, choice, felt_inertia, per_joint, positive, switch
 from .ilc import Fed, load_learned
+from .loop_formula import LoopFormula
 from .nominal import difference
 from .observers import Kalman, Observer, VelocityFilter
 from .play import Play, Rotors
@@ -132,15 +134,17 @@ class Loop:
         width w of a count has w / sqrt(12)."""
         out = np.full(self.model.nv, 1e-4)
         if self.counts:
-            scalar, unit = self._counted()
+            scalar, unit = self.encoders()
             out[self.model.jnt_dofadr[scalar]] = np.maximum(unit / np.sqrt(12.0), 1e-6)
         return out
 
-    def _counted(self) -> tuple[NDArray[np.intp], Array]:
-        """Scalar joints, and what a count of their encoders is [rad, m]."""
+    def encoders(self) -> tuple[NDArray[np.intp], Array]:
+        """Scalar joints, and what a count of their encoders is [rad, m], zero where they are exact."""
         scalar = np.flatnonzero(np.isin(self.model.jnt_type, SCALAR))
         turns = self.model.jnt_type[scalar] == mujoco.mjtJoint.mjJNT_HINGE
-        return scalar, np.where(turns, 2.0 * np.pi, 1.0) / self.counts
+        return scalar, np.where(turns, 2.0 * np.pi, 1.0) / self.counts if self.counts else np.zeros(
+            len(scalar)
+        )
 
     def start(self) -> LoopMemory:
         """Nothing on its way, nothing measured yet."""
@@ -172,6 +176,16 @@ class Loop:
             given, rotors = self.play.pass_on(given, at, v, rotors or self.play.start(at, v))
         return given, LoopMemory(inner, seen, queue[1:], told, middles, rotors, cut)
 
+    def formula(self, period: float) -> Formula | None:
+        """See :class:`~pantograph.sim.formula.Formula`; None around a law that has none, and with a filter
+        that knows a model, a predictor, play of gears or friction."""
+        make, watches = getattr(self.law, "formula", None), self.observer
+        simple = watches is None or isinstance(watches, VelocityFilter)
+        if make is None or not simple or self.predictor or len(self.play.dofs) or self.lost:
+            return None
+        inner: Formula | None = make(period)
+        return None if inner is None else LoopFormula(self, inner, period).formula()
+
     def _lost(self, v: Array) -> Array:
         """What dry friction takes (nv,) at speeds ``v`` (nv,), also from a drive at its limit."""
         return np.asarray(-self.friction * np.tanh(v / self.stiction))
@@ -181,14 +195,13 @@ class Loop:
         if not (self.counts or self._plays):
             return q, play
         m, y = self.model, q.copy()
-        scalar = np.flatnonzero(np.isin(m.jnt_type, SCALAR))
+        scalar, unit = self.encoders()
         at, dof = m.jnt_qposadr[scalar], m.jnt_dofadr[scalar]
         if self._plays:
             half = 0.5 * self.backlash[dof]
             play = y[at] if play is None else np.clip(play, y[at] - half, y[at] + half)
             y[at] = play
         if self.counts:
-            _, unit = self._counted()
             y[at] = np.round(y[at] / unit) * unit
         return y, play
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pantograph.controllers.ilc import Fed
 from pantograph.sim.clip import Clip
 from pantograph.sim.compose import make_law
 from pantograph.sim.control import Sampled
@@ -34,6 +35,9 @@ LAWS = [
     ("computed-torque", {}),
     ("lqr", {}),
     ("lqr", {"final": 0.5}),
+    ("pd", {"encoder": 4096, "delay": 0.004, "observer": "filter", "corner": 80.0}),
+    ("pid", {"backlash": 0.002, "observer": "filter", "encoder": 20000}),
+    ("computed-torque", {"delay": 0.003, "backlash": 0.001}),
 ]
 
 
@@ -49,7 +53,7 @@ class Unknown:
     """A law that is no expression: the one inside it, as Python calls it."""
 
     def __init__(self, law):
-        self.law = law
+        self.law, self.lost = law, getattr(law, "lost", None)
 
     def start(self):
         return self.law.start()
@@ -58,7 +62,9 @@ class Unknown:
         return self.law(t, q, v, target, memory)
 
 
-def random_machine(seed, *, joints=("hinge", "slide", "ball", "free"), narrow=False, moving=True):
+def random_machine(
+    seed, *, joints=("hinge", "slide", "ball", "free"), narrow=False, moving=True, motors=False
+):
     """A random tree with joints of every role, motors and servos on some of the tracked ones."""
     rng, spec = np.random.default_rng(seed), mujoco.MjSpec()
     bodies, tracks, roles, driven = [spec.worldbody], {}, [], []
@@ -81,14 +87,14 @@ def random_machine(seed, *, joints=("hinge", "slide", "ball", "free"), narrow=Fa
             kinds = ["clamped", "natural"] if role == Role.TRACKED or not moving else ["clamped", "linear"]
             values = [[0.0], [0.3 * rng.normal()], [0.1]] if moving else [[0.1]] * 3
             tracks[f"j{i}"] = keyed([0.0, bend, 0.1], values, kind=str(rng.choice(kinds)))
-        if role == Role.TRACKED and scalar and rng.random() < 0.6:
+        if role == Role.TRACKED and scalar and (motors or rng.random() < 0.6):
             act = spec.add_actuator(name=f"a{i}", target=f"j{i}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
             act.gear[0] = rng.choice([1.0, -2.5])
             act.gainprm[0] = 3.0
-            if rng.random() < 0.5:  # a servo, whose bias the controller has to overcome
+            if not motors and rng.random() < 0.5:  # a servo, whose bias the controller has to overcome
                 act.biastype = mujoco.mjtBias.mjBIAS_AFFINE
                 act.biasprm[:3] = [0.1, -3.0, -0.2]
-            if rng.random() < 0.6:
+            if motors or rng.random() < 0.6:
                 act.ctrlrange, act.ctrllimited = [-0.8, 0.5], True
             driven.append(Drive.CONTROLLER)
         body.add_geom(
@@ -205,3 +211,47 @@ def test_forces_that_are_no_numbers_end_the_run_with_the_joints_name(engine, tol
     with pytest.raises(Broken, match=r"failed at t = 0\.051 s: .* no finite force for joint 'j\d'") as broken:
         engine().run(problem, (0.0, problem.duration), Sampled(law, problem, 0.003))
     assert broken.value.segment.t[-1] == pytest.approx(0.051)
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        ("pd", {"top_speed": 1.0, "saturation": 0.5}),
+        ("pid", {"top_speed": 0.7}),
+        ("pd", {"top_speed": 1.5, "observer": "filter"}),
+    ],
+)
+@settings(max_examples=3)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_motors_that_give_less_at_speed(law, words, seed):
+    problem = random_machine(seed, joints=("hinge", "slide", "free"), motors=True)
+    assert tick_of(Sampled(make_law(law, problem, dict(words), 0.003), problem, 0.003), 1.0) is not None
+    assert_alike(*both(problem, law, words))
+
+
+def test_learned_forces_are_added_a_tick_at_a_time():
+    problem, period = random_machine(8), 0.003
+    rows = np.random.default_rng(0).normal(size=(20, problem.model.nv))  # fewer than the run has ticks
+    law = Fed(make_law("pid", problem, {}, period), rows, period)
+    span = (0.0, problem.duration)
+    assert_alike(
+        *(SmoothEngine().run(problem, span, Sampled(x, problem, period)) for x in (law, Unknown(law)))
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [{"observer": "kalman"}, {"play": 0.01}, {"friction": 0.1}, {"delay": 0.006, "predict": True}],
+)
+def test_what_is_no_expression_is_sampled_by_python(words):
+    problem = random_machine(5, joints=("hinge", "hinge"))
+    problem.model.dof_armature[:] = 0.02
+    assert tick_of(Sampled(make_law("pd", problem, dict(words), 0.003), problem, 0.003), 1.0) is None
+    ours, theirs = both(problem, "pd", words)
+    np.testing.assert_array_equal(ours.q, theirs.q)
+
+
+def test_encoders_of_keyed_joints_play_no_part():
+    machines = (random_machine(seed) for seed in range(99))
+    problem = next(m for m in machines if (m.roles == Role.KEYED).any() and len(m.roles) > 2)
+    assert_alike(*both(problem, "pd", {"encoder": 100, "backlash": 0.01, "observer": "filter"}))
