@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..models import joint_names
 from ..sim.errors import PantographError, unknown
+from ..sim.kinds import SCALAR
 
 Array = NDArray[np.float64]
 Gain = float | Mapping[str, float] | Array
@@ -127,10 +128,11 @@ def felt_inertia(model: mujoco.MjModel, q: Array) -> Array:
 
 
 def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """Least and greatest force (nv,) that the actuators on each hinge or slide can give [N, N m].
+    """Least and greatest force (nv,) that the actuators on each freedom can give [N, N m].
 
-    Infinite for a freedom without a working actuator (its joint force is ideal). Actuators whose gain depends
-    on position or speed are limited by their force range alone.
+    Infinite for a freedom without a working actuator of its own (its joint force is ideal): on a ball or free
+    joint those count whose gear names one axis of the joint's frame. Actuators whose gain depends on position
+    or speed are limited by their force range alone.
     """
     low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for i in range(model.nu):
@@ -139,7 +141,10 @@ def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
         if int(model.actuator_trntype[i]) not in joint_like or not np.any(model.actuator_gainprm[i, :3]):
             continue
         joint = int(model.actuator_trnid[i, 0])
-        dof, gear = int(model.jnt_dofadr[joint]), float(model.actuator_gear[i, 0])
+        found = _freedom(model, i)
+        if found is None:
+            continue
+        dof, gear = found
         ends = np.array([-np.inf, np.inf])
         motor = (
             model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
@@ -155,10 +160,21 @@ def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
             low[dof], high[dof] = ends
         else:
             low[dof], high[dof] = low[dof] + ends[0], high[dof] + ends[1]
-        if model.jnt_actfrclimited[joint]:
+        if model.jnt_actfrclimited[joint]:  # of hinges and slides
             low[dof] = max(low[dof], float(model.jnt_actfrcrange[joint, 0]))
             high[dof] = min(high[dof], float(model.jnt_actfrcrange[joint, 1]))
     return low, high
+
+
+def _freedom(model: mujoco.MjModel, i: int) -> tuple[int, float] | None:
+    """The one freedom that actuator ``i`` of a joint acts on, and its gear; None when it is not one."""
+    joint = int(model.actuator_trnid[i, 0])
+    scalar = int(model.jnt_type[joint]) in SCALAR
+    if not scalar and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINTINPARENT:
+        return None  # axes of the parent's frame are none of the freedoms
+    gears = model.actuator_gear[i, : int((model.dof_jntid == joint).sum())]
+    axes = np.flatnonzero(gears)
+    return (int(model.jnt_dofadr[joint] + axes[0]), float(gears[axes[0]])) if len(axes) == 1 else None
 
 
 def unit_free_gains(inertia: Array, frequency: float, damping: float) -> tuple[Array, Array]:

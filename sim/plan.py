@@ -15,7 +15,7 @@ from .engines.interface import Drive, Problem, Role
 from .engines.smooth import adaptive_methods, width_of
 from .engines.smooth import methods as smooth_methods
 from .errors import SceneError, unknown
-from .explain import cheaper, left_out, other_physics, solved
+from .explain import cheaper, ideal_drives, left_out, other_physics, solved, unheld
 from .needs import Needs
 from .scene.angles import law_words
 from .scene.build import Setup, resolve
@@ -35,7 +35,8 @@ class Choice:
 class Plan:
     """How a scene is computed.
 
-    ``period`` [s] is the controller's, None without one. ``left_out`` and ``cheaper`` are sentences;
+    ``period`` [s] is the controller's, None without one. ``left_out`` and ``cheaper`` are sentences, and so
+    are ``notes``, on what the controller does otherwise than one may think;
     ``goals`` says of every goal by name whether it is baked or live.
     """
 
@@ -48,6 +49,7 @@ class Plan:
     left_out: tuple[str, ...]
     cheaper: tuple[str, ...]
     goals: tuple[tuple[str, Choice], ...] = ()
+    notes: tuple[str, ...] = ()
 
     def joints(self, role: Role) -> tuple[str, ...]:
         """Names of the joints in a role."""
@@ -126,6 +128,15 @@ def plan_setup(setup: Setup) -> Plan:
         tuple(left_out(needs, engine.what) + other_physics(problem, engine.what)),
         tuple(cheaper(needs, engine.what, integrator.what)),
         tuple((name, Choice(how, why)) for name, how, why in solved(setup, needs.period)),
+        tuple(_notes(setup)) if needs.period is not None else (),
+    )
+
+
+def _notes(setup: Setup) -> list[str]:
+    """What a person should know of the controller before they trust the run."""
+    item = setup.scene.controller
+    return ideal_drives(setup) + (
+        unheld(setup, item.law, law_words(setup.scene, setup.model)) if item else []
     )
 
 

@@ -61,7 +61,8 @@ def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
     try:
         derived = derive(problem, segment)
         missed = _missed(setup, segment)
-        notes = _sentences(setup, missed, segment.t) + check_frames(setup, segment.t, segment.q)
+        notes = [*plan.notes, *_sentences(setup, missed, segment.t)]
+        notes += check_frames(setup, segment.t, segment.q)
         if engine is not None and status == "done" and segment.stats["steps"]:
             controls = make_controls(setup.scene, problem, plan.period)
             estimate = estimate_error(engine, problem, segment, controls)

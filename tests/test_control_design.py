@@ -33,6 +33,7 @@ from pantograph.controllers.design import (
 )
 from pantograph.controllers.design.law import loop_of
 from pantograph.controllers.design.linear import exponential
+from pantograph.controllers.gains import force_limits
 from pantograph.controllers.lqr import LQR
 from pantograph.controllers.nominal import Nominal, moved
 from pantograph.models import load_model
@@ -662,3 +663,26 @@ observer = "filter"
     assert {p.name for p in Path("out").iterdir()} == {f"press.{x}.png" for x in ("bode", "locus", "step")}
     with pytest.raises(PantographError, match="outside the scene, which lasts 1 s"):
         cli.gains(Path("press.toml"), at=7.0)
+
+
+@pytest.mark.parametrize("kind", ["ball", "free"])
+def test_force_limits_of_motors_on_one_joint_are_of_their_axes(kind, recwarn):
+    motors = "".join(
+        f'<motor joint="j" gear="{gear}" {limit}/>'
+        for gear, limit in (
+            ("2 0 0 0 0 0", 'ctrllimited="true" ctrlrange="-.1 .1"'),
+            ("0 -1 0 0 0 0", 'ctrllimited="true" ctrlrange="-.2 .4"'),
+            ("0 1 0 0 0 0", 'forcelimited="true" forcerange="-1 1"'),
+            ("0 0 1 0 0 0", ""),
+        )
+    )
+    m = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><body><joint name="j" type="{kind}"/><geom size=".1"/></body></worldbody>
+        <actuator>{motors}<motor jointinparent="j" gear="1 0 0 0 0 0" forcerange="-9 9"/>
+        <motor joint="j" gear="1 1 0 0 0 0" forcerange="-9 9"/></actuator></mujoco>"""
+    )
+    low, high = force_limits(m)
+    free = [np.inf] * (m.nv - 2)
+    np.testing.assert_allclose(high, [0.2, 1.2, *free])
+    np.testing.assert_allclose(low, [-0.2, -1.4, *np.negative(free)])
+    assert not len(recwarn)

@@ -425,3 +425,128 @@ def test_limits_of_balls_take_the_contact_engine(tmp_path):
 def test_the_width_of_friction_stays_when_the_step_changes():
     plan = plan_of(models=[{"file": "arm6"}], physics={"contacts": "none"})
     assert plan.problem.friction_width == width_of(replace(plan.problem, step=plan.problem.step / 2)) > 0
+
+
+ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size=".02" pos=".3 0 0" mass="1"/>
+  <body pos=".3 0 0"><joint name="b" {joint}/><geom size=".02" pos=".2 0 0.1" mass="1"/></body></body>
+  </worldbody>
+  <tendon><fixed name="rope"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
+  <actuator><motor name="ma" joint="a"/>{actuator}</actuator></mujoco>"""
+HINGE, BALL_JOINT = 'axis="0 1 0"', 'type="ball"'
+
+
+def arm_with(folder, actuator, joint=HINGE, **data):
+    text = ARM.format(actuator=actuator, joint=joint)
+    text = text if joint == HINGE else text.replace('<joint joint="b" coef="1"/>', "")
+    (folder / "arm.xml").write_text(text)
+    models = [{"file": str(folder / "arm.xml")}]
+    data = {"roles": {"tracked": ["a", "b"]}, "physics": {"contacts": "none"}, "duration": 0.02, **data}
+    return Scene(**data, models=models)
+
+
+@pytest.mark.parametrize(
+    ("actuator", "joint", "said"),
+    [
+        ('<motor name="m" joint="b"/>', HINGE, None),
+        ("", HINGE, None),
+        (
+            '<general name="m" joint="b" dyntype="filter" dynprm=".1" gainprm="1"/>',
+            HINGE,
+            "tracked joint 'b', instead of actuator 'm': no controller drives it, since it has activation",
+        ),
+        (
+            '<muscle name="m" joint="b" lengthrange="0 1"/>',
+            HINGE,
+            "tracked joint 'b', instead of actuator 'm'",
+        ),
+        (
+            '<motor name="m" tendon="rope"/>',
+            HINGE,
+            "tracked joint 'b', instead of actuator 'm': no controller drives it, since it does not act",
+        ),
+        (
+            '<motor name="m" joint="b" gear="1 0 0"/><motor name="n" joint="b" gear="0 2 0"/>',
+            BALL_JOINT,
+            "tracked joint 'b', instead of actuators 'm', 'n': no controller drives it, since it acts on",
+        ),
+    ],
+)
+def test_tracked_joints_whose_drives_no_controller_uses_are_told(tmp_path, actuator, joint, said):
+    scene = arm_with(tmp_path, actuator, joint, controller={"law": "pd"})
+    notes = make_plan(scene).notes
+    if said is None:
+        assert notes == ()
+        return
+    (note,) = notes
+    assert f"ideal forces without limit on {said}" in note
+    assert note in run(scene).notes
+    idle = [line for line in make_plan(scene).left_out if line.startswith("actuators that nothing")]
+    assert len(idle) == 1
+
+
+def test_a_drive_that_the_scene_switches_off_is_told(tmp_path):
+    words = {"actuators": {"m": "off"}, "controller": {"law": "pd"}}
+    (note,) = make_plan(arm_with(tmp_path, '<motor name="m" joint="b"/>', **words)).notes
+    assert note.endswith("instead of actuator 'm': it is off; 'controller' in [actuators] uses it")
+
+
+def test_a_keyed_tendon_is_no_servo_of_the_joint_of_its_number(tmp_path):
+    """Tendon 0 is not joint 0: tracked joints still get their controller."""
+    roles = {"tracked": ["a"]}
+    keys = [{"actuator": "m", "times": [0], "values": [0]}]
+    text = ARM.format(actuator='<motor name="m" tendon="rope"/>', joint=HINGE)
+    (tmp_path / "arm.xml").write_text(text.replace('<motor name="ma" joint="a"/>', ""))
+    models = [{"file": str(tmp_path / "arm.xml")}]
+    plan = make_plan(Scene(duration=0.1, models=models, roles=roles, keys=keys))
+    assert plan.period == 0.002
+    (note,) = plan.notes
+    assert "'a', instead of actuator 'm': keys drive it, since it does not act on one joint" in note
+
+
+@pytest.mark.parametrize("law", ["lqr", "mpc", "nmpc"])
+@pytest.mark.parametrize(
+    ("start", "goal", "said"),
+    [
+        (0.0, None, None),
+        (0.2, None, "'hinge' at 0.2 rad, as it starts, where it needs"),
+        (0.2, 0.0, None),
+        (3.14159265, None, None),
+        (0.0, 0.3, "'hinge' at 0.3 rad, where it needs"),
+    ],
+)
+def test_a_law_that_regulates_about_no_equilibrium_says_so(law, start, goal, said):
+    """A pole falls from any angle but upright and hanging; the force is that of its weight by hand."""
+    goals = {} if goal is None else {"goal": {"hinge": goal}}
+    plan = plan_of(
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        initial={"position": {"hinge": start}},
+        controller={"law": law, **goals},
+    )
+    assert len(plan.notes) == (said is not None)
+    if said is not None:
+        m = plan.setup.model
+        pole = m.body(m.jnt_bodyid[m.joint("hinge").id]).id
+        lever = m.body_mass[pole] * 9.81 * np.hypot(m.body_ipos[pole][0], m.body_ipos[pole][2])
+        force = abs(lever * np.sin(start if goal is None else goal))
+        assert f"{said} {force:.3g} N m but nothing drives it" in plan.notes[0]
+
+
+def test_what_rests_on_springs_friction_or_servos_is_an_equilibrium(tmp_path):
+    def notes(joint, drive="", **data):
+        (tmp_path / "lift.xml").write_text(
+            f"""<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+            <body pos="1 0 0"><joint name="z" type="slide" axis="0 0 1" {joint}/><geom size=".1" mass="2"/>
+            </body></body></worldbody><actuator>{drive}</actuator></mujoco>"""
+        )
+        models = [{"file": str(tmp_path / "lift.xml")}]
+        data = {"roles": {"tracked": ["x"]}, "controller": {"law": "lqr"}} | data
+        return make_plan(Scene(duration=1.0, models=models, physics={"contacts": "none"}, **data)).notes
+
+    (note,) = notes('damping="1"')
+    assert "'z' at 0 m, as it starts, where it needs 19.6 N but nothing drives it" in note
+    assert notes('stiffness="196.2" springref="0.1"') == ()
+    assert notes('frictionloss="20"') == ()
+    servo = {"actuators": {"p": "keys"}}
+    assert notes("", '<position name="p" joint="z" kp="1000"/>', **servo) == ()
+    assert notes('damping="1"', controller={"law": "pd"}) == ()

@@ -128,6 +128,8 @@ def plan(console: Console, plan: Plan, measured: str | None = None) -> None:
         actuators = plan.actuators(drive)
         if actuators:
             table.add_row(f"actuators by {drive.name.lower()}", escape(", ".join(actuators)))
+    for line in plan.notes:
+        table.add_row("note", escape(line))
     for line in plan.left_out:
         table.add_row("left out", escape(line))
     for line in plan.cheaper:
