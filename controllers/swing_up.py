@@ -71,8 +71,8 @@ class SwingUp:
 
     ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, and again every
     ``every`` [s] until the catch has the machine, unless it is on its way home as foreseen; zero foresight
-    takes the first set. Joints
-    that have a range must stay in it with ``room`` [rad, m] to spare. Hinges count modulo a turn.
+    takes the first set. Joints that have a range must stay in it with ``room`` [rad, m] to spare. Hinges
+    count modulo a turn.
     Keys of the driven joint play no part. A look ahead takes far longer than a sample (the control bench
     tells how long); the last answer is kept, so that one who asks once before a run has the first one in
     time. Raises PantographError when the machine has not exactly one driven joint, or no such goal.
