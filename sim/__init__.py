@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .control import Law, Target
     from .errors import (
         EngineError,
         FilmError,
@@ -36,6 +37,7 @@ __all__ = [
     "EngineError",
     "ErrorEstimate",
     "FilmError",
+    "Law",
     "ModelError",
     "PantographError",
     "Plan",
@@ -44,6 +46,7 @@ __all__ = [
     "RunError",
     "Scene",
     "SceneError",
+    "Target",
     "load",
     "load_scene",
     "make_plan",
@@ -55,6 +58,7 @@ __all__ = [
 
 _HOME = {"plot": "plots", "run": "run", "shoot": "shoot", "Scene": "scene.schema"}
 _HOME |= dict.fromkeys([name for name in __all__ if name.endswith("Error")], "errors")
+_HOME |= dict.fromkeys(["Law", "Target"], "control")
 _HOME |= dict.fromkeys(["Plan", "make_plan"], "plan")
 _HOME |= dict.fromkeys(["ErrorEstimate", "Recording", "load"], "recording")
 _HOME |= dict.fromkeys(["load_scene", "parse_scene"], "scene.load")

@@ -13,6 +13,7 @@ import numpy as np
 from .accuracy import estimate_error
 from .checks import check_frames
 from .compose import make_controls, make_engine
+from .control import Law, Sampled
 from .engines.common import Broken
 from .engines.derive import derive
 from .engines.interface import Array, Engine, Role, Segment
@@ -29,31 +30,42 @@ def run(
     scene: Scene | Plan | str | Path,
     *,
     error: bool = False,
+    law: Law | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Recording:
     """Compute a scene: a Scene, its Plan, or the path of a scene file.
 
-    ``error`` adds an estimate of the discretisation error, billed apart. ``progress`` is told the
-    simulated time [s]. A run that diverges or is interrupted returns what it has, with a status and message.
-    Raises SceneError for a scene with mistakes, EngineError for what the engine cannot do, and RunError, with
-    what it has, when the controller or the engine fails on the way.
+    ``error`` adds an estimate of the discretisation error, billed apart. ``law`` is one of your own, sampled
+    in place of the scene's, at its controller's period. ``progress`` is told the simulated time [s]. A run
+    that diverges or is interrupted returns what it has, with a status and message. Raises SceneError for a
+    scene with mistakes, EngineError for what the engine cannot do, and RunError, with what it has, when the
+    controller or the engine fails on the way.
     """
     plan = scene if isinstance(scene, Plan) else make_plan(scene)
     problem = plan.problem
     engine = make_engine(plan.engine.what)
-    controls = make_controls(plan.setup.scene, problem, plan.period)
+    controls = _controls(plan, law)
     failure: BaseException | None = None
     try:
         segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
     except Broken as broken:
         segment, failure = broken.segment, broken.__cause__
-    recording = _recorded(plan, segment, engine if error else None)
+    recording = _recorded(plan, segment, engine if error else None, law)
     if failure is not None:
         raise RunError(recording) from failure
     return recording
 
 
-def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
+def _controls(plan: Plan, law: Law | None) -> Sampled | None:
+    """The scene's controller, or ``law`` in its place."""
+    if law is None:
+        return make_controls(plan.setup.scene, plan.problem, plan.period)
+    if plan.period is None:
+        raise EngineError("a law needs joints to drive: name them in the scene's roles.tracked")
+    return Sampled(law, plan.problem, plan.period)
+
+
+def _recorded(plan: Plan, segment: Segment, engine: Engine | None, law: Law | None) -> Recording:
     """The recording of a segment, with an error estimate when the ``engine`` for it is given."""
     problem, setup = plan.problem, plan.setup
     status, message, estimate, notes = segment.status, segment.message, None, [_UNCHECKED]
@@ -64,8 +76,7 @@ def _recorded(plan: Plan, segment: Segment, engine: Engine | None) -> Recording:
         notes = [*plan.notes, *_sentences(setup, missed, segment.t)]
         notes += check_frames(setup, segment.t, segment.q)
         if engine is not None and status == "done" and segment.stats["steps"]:
-            controls = make_controls(setup.scene, problem, plan.period)
-            estimate = estimate_error(engine, problem, segment, controls)
+            estimate = estimate_error(engine, problem, segment, _controls(plan, law))
     except EngineError as e:
         notes.append(f"no error estimate: {e}")
     except KeyboardInterrupt:

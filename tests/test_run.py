@@ -160,6 +160,31 @@ def test_a_controller_that_fails_or_gives_no_number_is_named_and_the_run_kept(mo
     assert np.isfinite(kept.tau).all()
 
 
+class Spring:
+    """A law of one's own: a spring to the keys and a damper, and the number of its samples as memory."""
+
+    def start(self):
+        return 0
+
+    def __call__(self, t, q, v, target, memory):
+        return 20.0 * (target.q - q) - 2.0 * v, memory + 1
+
+
+def test_a_law_of_ones_own_drives_a_scene_as_the_same_built_in_one():
+    keys = [{"joint": "hinge", "times": [0, 1], "values": [0.5, 0.5]}]
+    words = {"law": "pd", "period": 0.01, "kp": 20.0, "kd": 2.0, "gravity": False}
+    scene = Scene(
+        duration=1.0, models=[{"file": "pendulum"}], roles={"tracked": ["hinge"]}, keys=keys, controller=words
+    )
+    known, own = run(scene, error=True), run(scene, law=Spring(), error=True)
+    np.testing.assert_allclose(own.q, known.q, atol=1e-12)
+    np.testing.assert_allclose(own.error.angle, known.error.angle, atol=1e-12)
+    assert len(own.tick_t) == 100 and own.tick_t[1] == 0.01
+    passive = Scene(duration=1.0, models=[{"file": "pendulum"}])
+    with pytest.raises(EngineError, match=r"roles\.tracked"):
+        run(passive, law=Spring())
+
+
 def test_an_estimate_that_fails_leaves_the_run_and_a_note(monkeypatch):
     def fails(*args):
         raise EngineError("too many impacts")
