@@ -20,7 +20,9 @@ from ..sim.errors import PantographError
 console = Console()
 _UNITS = (
     "Where a scene's angles are degrees, rad, rad/s and rad/s^2 are degrees for hinges, also in --sweep; "
-    "gains stay as listed."
+    "gains stay as listed. Gains, weights and limits are one number for all joints, or one a joint: with "
+    'kp = {elbow = 40}, joints that are not named keep the default; with kp = {"" = 20, elbow = 40}, they '
+    "have what all others have, 20."
 )
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked joints.")]
 

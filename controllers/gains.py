@@ -59,18 +59,18 @@ def per_joint(
     what: str,
     gain: Gain,
     *,
-    missing: float = 0.0,
+    missing: float | Array = 0.0,
     zero: bool = True,
     tracked: NDArray[np.bool_] | None = None,
 ) -> Array:
     """One number >= 0 (> 0 without ``zero``) a degree of freedom (nv,), from one for all or one a joint by
-    name, or as it is, (nv,); "" stands for all joints, before others are named, which have ``missing``
-    without it.
+    name, or as it is, (nv,). Joints that are not named have what "" is given, for all others, and without it
+    ``missing``, one number or (nv,): the default of the law.
 
     Raises PantographError for what is no such number or no mapping of them, and a name that is no joint, or,
     with ``tracked`` (nv,), none of a tracked joint.
     """
-    out = np.full(model.nv, missing)
+    out = np.array(np.broadcast_to(missing, model.nv), dtype=float)
     names = {name: j for j, name in enumerate(joint_names(model))}
     able = (
         names if tracked is None else {n: j for n, j in names.items() if tracked[model.dof_jntid == j].any()}
@@ -101,17 +101,15 @@ def force_weights(
 ) -> Array:
     """Cost (m,) of the squared force of each driven freedom ``tracked`` (nv,).
 
-    Without ``force`` it is 1 / f^2 with f what the freedom's drive can give, or its ``weight`` (nv,) [N m, N]
-    (at least 1) where it can give anything. Raises PantographError, naming the law ``what``, for forces that
-    cost nothing.
+    Where ``force`` says nothing it is 1 / f^2 with f what the freedom's drive can give, or its ``weight``
+    (nv,) [N m, N] (at least 1) where it can give anything. Raises PantographError, naming the law
+    ``what``, for forces that cost nothing.
     """
-    if force is None:
-        low, high = force_limits(model)
-        able = np.minimum(-low, high)
-        scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(weight)))
-        weights = 1.0 / np.maximum(scale, 1e-9) ** 2
-    else:
-        weights = per_joint(model, f"{what} force", force, tracked=tracked)
+    low, high = force_limits(model)
+    able = np.minimum(-low, high)
+    scale = np.where(np.isfinite(able), able, np.maximum(1.0, np.abs(weight)))
+    own = 1.0 / np.maximum(scale, 1e-9) ** 2
+    weights = per_joint(model, f"{what} force", {} if force is None else force, missing=own, tracked=tracked)
     if not (weights[tracked] > 0).all():
         raise PantographError(f"{what} force: every joint that it drives must cost something")
     return np.asarray(weights[tracked])

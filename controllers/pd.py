@@ -28,7 +28,8 @@ class PD:
 
     Without explicit gains they follow from a bandwidth: kp = m w^2, kd = 2 zeta m w with w = 2 pi
     ``frequency`` [Hz] and m = 1 / (M^-1)_ii, the inertia that the joint feels at ``q0`` when the others are
-    free. ``kp`` [N m/rad or N/m] and ``kd`` [N m s/rad or N s/m] are one number, or one a joint by name.
+    free. ``kp`` [N m/rad or N/m] and ``kd`` [N m s/rad or N s/m] are one number, or one a joint by name;
+    joints that are not named have what "" is given, or these.
     Raises PantographError for a gain that is negative or names no joint of the model.
     """
 
@@ -51,12 +52,10 @@ class PD:
         self.data = mujoco.MjData(model)
         inertia = felt_inertia(model, q0)
         w = 2.0 * np.pi * frequency
-        self.kp = inertia * w**2 if kp is None else per_joint(model, "the PD law's kp", kp, tracked=tracked)
-        self.kd = (
-            2.0 * damping * np.sqrt(self.kp * inertia)
-            if kd is None
-            else per_joint(model, "the PD law's kd", kd, tracked=tracked)
-        )
+        own, kp, kd = inertia * w**2, {} if kp is None else kp, {} if kd is None else kd
+        self.kp = per_joint(model, "the PD law's kp", kp, missing=own, tracked=tracked)
+        own = 2.0 * damping * np.sqrt(self.kp * inertia)
+        self.kd = per_joint(model, "the PD law's kd", kd, missing=own, tracked=tracked)
 
     def start(self) -> None:
         """No memory."""

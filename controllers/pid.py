@@ -38,11 +38,12 @@ class PID:
     """PID on the degrees of freedom ``tracked`` (nv,) of ``model``.
 
     Gains follow from ``frequency`` [Hz] and ``damping`` as for PD, Ki = Kp w / 10; or ``kp`` [N m/rad,
-    N/m], ``ki`` [N m/(rad s), N/(m s)], ``kd`` [N m s/rad, N s/m] are given (one number, or one a joint by
-    name). ``filter`` [Hz] is the corner of the velocity filter
-    (default: ten times ``frequency``). ``feedforward``: nothing, the weight at the target, or all forces that
-    the target's motion needs. Beyond what its drives can give, less towards ``top_speed`` [rad/s, m/s], the
-    integral runs back within ``windup`` [s] (default: the geometric mean of Ki/Kp and Kd/Kp times).
+    N/m], ``ki`` [N m/(rad s), N/(m s)], ``kd`` [N m s/rad, N s/m] are given: one number, or one a joint by
+    name, where joints that are not named have what "" is given, or these. ``filter`` [Hz] is the corner of
+    the velocity filter (default: ten times ``frequency``). ``feedforward``: nothing, the weight at the
+    target, or all forces that the target's motion needs. Beyond what its drives can give, less towards
+    ``top_speed`` [rad/s, m/s], the integral runs back within ``windup`` [s] (default: the geometric mean of
+    Ki/Kp and Kd/Kp times).
     """
 
     def __init__(
@@ -65,14 +66,11 @@ class PID:
         positive("the PID law's damping", damping)
         choice("feedforward", feedforward, _FEEDFORWARD, "the PID law")
         self.model, self.tracked, self.feedforward = model, tracked, feedforward
-        self.kp, self.kd = unit_free_gains(felt_inertia(model, q0), frequency, damping)
-        if kp is not None:
-            self.kp = per_joint(model, "the PID law's kp", kp, tracked=tracked)
-        if kd is not None:
-            self.kd = per_joint(model, "the PID law's kd", kd, tracked=tracked)
-        self.ki = (
-            self.kp * w / 10.0 if ki is None else per_joint(model, "the PID law's ki", ki, tracked=tracked)
-        )
+        kp, ki, kd = ({} if gain is None else gain for gain in (kp, ki, kd))
+        own_kp, own_kd = unit_free_gains(felt_inertia(model, q0), frequency, damping)
+        self.kp = per_joint(model, "the PID law's kp", kp, missing=own_kp, tracked=tracked)
+        self.ki = per_joint(model, "the PID law's ki", ki, missing=self.kp * w / 10.0, tracked=tracked)
+        self.kd = per_joint(model, "the PID law's kd", kd, missing=own_kd, tracked=tracked)
         corner = 10.0 * frequency if filter is None else positive("the PID law's filter", filter)
         self.lag = 1.0 / (2.0 * np.pi * corner)
         if windup is None:
