@@ -272,27 +272,23 @@ def test_a_hairpin_is_no_stop():
 
 
 @given(seeds)
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_limits_left_out_follow_from_those_that_stay(seed):
-    """The largest of any direction is the same with all rows and with the needed ones; some are equal, one
-    hardly differs, some ask for nothing, and one coordinate may be far larger."""
+    """What the others allow never exceeds them; some rows are equal, some hardly differ, some ask for nothing
+    or for the same of one coordinate, and one coordinate may be far larger."""
     rng = np.random.default_rng(seed)
-    rows = rng.normal(size=(3, 20, 3)) * [1.0, 10.0 ** rng.uniform(-6, 6), 1.0]
-    rows = np.concatenate([rows, -rows, rows[:, :5], 0.999 * rows[:, :3], np.zeros((3, 2, 3))], axis=1)
+    rows = rng.normal(size=(2, 20, 3)) * [1.0, 10.0 ** rng.uniform(-6, 6), 1.0]
+    rows[:, :8, 2] = 4.0
+    rows = np.concatenate([rows, -rows, rows[:, :5], 0.999 * rows[:, :3], np.zeros((2, 2, 3))], axis=1)
     positive = (False, bool(seed % 2), True)
     kept = needed(rows, positive)
     assert kept.sum() < 0.7 * kept.size
     ends = [(0.0 if p else None, None) for p in positive]
-    for at, mine in zip(rows, kept, strict=True):
-        unit = np.abs(at).max(axis=0)
-        for way in rng.normal(size=(5, 3)):
-            each = [
-                linprog(-way, A_ub=a / unit, b_ub=np.ones(len(a)), bounds=ends, method="highs")
-                for a in (at, at[mine])
-            ]
-            assert each[0].status == each[1].status
-            if each[0].status == 0:
-                assert each[1].fun == pytest.approx(each[0].fun, rel=1e-7)
+    for at, mine in zip(rows / np.abs(rows).max(axis=1, keepdims=True), kept, strict=True):
+        for row in at[~mine]:
+            most = linprog(-row, A_ub=at[mine], b_ub=np.ones(mine.sum()), bounds=ends, method="highs")
+            assert most.status == 0
+            assert -most.fun <= 1.0 + 1e-7
 
 
 @given(seeds)
