@@ -141,7 +141,7 @@ class Shooting:
     def improve(self, plan: Plan, ref: Horizon, iterations: int) -> Plan:
         """A better plan. Stops early when nothing is left to gain."""
         damping, done, tries = 0.0, 0, 0
-        while done < iterations:
+        while done + tries < iterations:
             A, B = self.derivatives(plan.x[:-1], plan.u, ref)
             change, K, gain = self._backward(plan, ref, A, B, damping)
             if gain <= 1e-9 * (1e-9 + plan.cost):
