@@ -291,6 +291,18 @@ def test_limits_left_out_follow_from_those_that_stay(seed):
             assert -most.fun <= 1.0 + 1e-7
 
 
+@pytest.mark.parametrize("jerk", [30.0, 3000.0])
+def test_all_limits_of_many_joints_are_asked_for(jerk):
+    """Forth and back, speeding up and braking: nothing is left for slowing down the whole."""
+    model, rng = load_model("arm6"), np.random.default_rng(5)
+    times, names = np.linspace(0.0, 3.0, 6), [model.joint(j).name for j in range(6)]
+    tracks = {n: keyed(times, rng.uniform(-0.9, 0.9, 6), kind="natural") for n in names}
+    able = machine(model, velocity=9.0, acceleration=8.0, jerk=jerk, force=np.inf)
+    found = retime(Clip(model, tracks, model.qpos0), able, points=400)
+    assert found.report.possible
+    assert found.slowed < 1.02
+
+
 @given(seeds)
 @settings(max_examples=10)
 def test_jerk_of_a_trace_is_that_of_the_polynomials(seed):

@@ -17,7 +17,7 @@ def needed(rows: Array, positive: tuple[bool, ...]) -> NDArray[np.bool_]:
     they allow); where y cannot be negative, ``positive`` (d,), from any with a larger coefficient, too.
     Rows that are zero are never needed, rows that are not finite always.
     """
-    out = np.any(rows != 0.0, axis=2)
+    out: NDArray[np.bool_] = np.any(rows != 0.0, axis=2)
     for mine, at in zip(out, rows, strict=True):
         some = np.flatnonzero(mine & np.isfinite(at).all(axis=1))
         size = np.abs(at[some]).max(axis=0, initial=0.0)
