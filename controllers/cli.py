@@ -202,19 +202,25 @@ def gains(
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
 ) -> None:
     """Poles, margins and step response of a scene under its law, about its keys (with contacts: its run)."""
+    from ..sim.explain import cautions
     from ..sim.plan import make_plan
+    from ..sim.recording import check_writable
+    from ..sim.scene.angles import law_words
     from ..sim.scene.load import load_scene
     from . import design
     from .design import figures
     from .design.law import loop_of
+    from .experiments import _told as told
 
+    check_writable(out)
     loaded = load_scene(scene)
-    own = loaded.controller
-    law = law or (own.law if own else "pd")
-    words = own.parameters if own and own.law == law else {}
-    system, K, says, mechanism = loop_of(make_plan(loaded), law, words, t=at)
+    law = law or (loaded.controller.law if loaded.controller else "pd")
+    words, plan = told(loaded, law), make_plan(loaded)
+    system, K, says, mechanism = loop_of(plan, law, words, t=at)
     if joint and joint not in system.inputs:
         raise PantographError(f"no tracked joint {joint!r}; there is: {', '.join(system.inputs)}")
+    for note in cautions(plan.setup, law, law_words(loaded, plan.problem.model, words)):
+        console.print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True, highlight=False)
     console.print(f"linearised {says}", soft_wrap=True, highlight=False)
     verdicts = [design.controllability(mechanism), design.stabilisability(mechanism)]
     if words.get("observer", "none") != "none":
@@ -232,7 +238,6 @@ def gains(
         "locus": figures.locus(system, K),
         "step": figures.step(system, K, state, input=chosen),
     }
-    out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
         path = out / f"{scene.stem}.{name}.png"
         picture.savefig(path, dpi=120)

@@ -84,6 +84,11 @@ def other_physics(problem: Problem, engine: str) -> list[str]:
     return out
 
 
+def cautions(setup: Setup, law: str, words: Mapping[str, Any]) -> list[str]:
+    """What a person should know of a law, told ``words`` in SI, before they trust what it does."""
+    return ideal_drives(setup) + unheld(setup, law, words)
+
+
 def ideal_drives(setup: Setup) -> list[str]:
     """Tracked joints that get ideal forces, without any limit, although actuators act on them: which, why,
     and what would give them their limits."""

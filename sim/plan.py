@@ -15,7 +15,7 @@ from .engines.interface import Drive, Problem, Role
 from .engines.smooth import adaptive_methods, width_of
 from .engines.smooth import methods as smooth_methods
 from .errors import SceneError, unknown
-from .explain import cheaper, ideal_drives, left_out, other_physics, solved, unheld
+from .explain import cautions, cheaper, left_out, other_physics, solved
 from .needs import Needs
 from .scene.angles import law_words
 from .scene.build import Setup, resolve
@@ -135,9 +135,7 @@ def plan_setup(setup: Setup) -> Plan:
 def _notes(setup: Setup) -> list[str]:
     """What a person should know of the controller before they trust the run."""
     item = setup.scene.controller
-    return ideal_drives(setup) + (
-        unheld(setup, item.law, law_words(setup.scene, setup.model)) if item else []
-    )
+    return cautions(setup, item.law if item else "pd", law_words(setup.scene, setup.model))
 
 
 def _solver(scene: Scene) -> list[Mistake]:

@@ -7,7 +7,9 @@ import pytest
 from pantograph.controllers import cli
 from pantograph.controllers.design import LinearSystem, closed_loop, figures, held, margins
 from pantograph.controllers.design.law import loop_of
-from pantograph.sim import Scene, make_plan, run
+from pantograph.sim import PantographError, Scene, make_plan, run
+from pantograph.sim.compose import make_law
+from pantograph.sim.control import Target
 from scipy import linalg
 
 SLIDE = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
@@ -144,3 +146,103 @@ ki = 9000.0
     assert "unstable" in said
     assert "NO" in said
     assert {p.suffix for p in Path("out").iterdir()} == {".png"}
+
+
+CART = """duration = 1.0
+[[models]]
+file = "cart_pole"
+[roles]
+tracked = ["slide"]
+[initial.position]
+hinge = 0.2
+[controller]
+law = "lqr"
+period = 0.01
+velocity = 2.0
+goal = {hinge = 0.0}
+delay = 0.02
+observer = "filter"
+"""
+
+
+@pytest.mark.parametrize(
+    ("law", "told"),
+    [
+        ("", {"velocity", "goal", "delay", "observer"}),
+        ("lqr", {"velocity", "goal", "delay", "observer"}),
+        ("mpc", {"goal", "delay", "observer"}),
+        ("pd", {"delay", "observer"}),
+    ],
+)
+def test_another_law_is_told_what_the_scene_says_of_its_task_and_its_loop(tmp_path, monkeypatch, law, told):
+    monkeypatch.chdir(tmp_path)
+    Path("cart.toml").write_text(CART)
+    heard = {}
+
+    def spy(plan, law, words, **more):
+        heard.update(words)
+        return loop_of(plan, law, words, **more)
+
+    monkeypatch.setattr("pantograph.controllers.design.law.loop_of", spy)
+    cli.gains(Path("cart.toml"), law=law)
+    assert set(heard) == told
+    assert {word: heard[word] for word in ("delay", "observer")} == {"delay": 0.02, "observer": "filter"}
+
+
+def cart(law, **words):
+    return Scene(
+        duration=1.0,
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        initial={"position": {"hinge": 3.0}},
+        controller={"law": law, "period": 0.02, **words},
+    )
+
+
+def test_the_loop_of_a_swing_up_is_the_one_that_its_catch_closes():
+    """It holds the pole up: stable about the goal, by the gains that it applies there."""
+    plan = make_plan(cart("swing-up"))
+    system, K, says, alone = loop_of(plan, "swing-up", {"delay": 0.01})
+    assert "about the goal, where the catch holds" in says
+    assert "left out of the loop: delay" in says
+    assert margins(system, K).stable
+    assert not margins(alone, np.zeros((1, 4))).stable
+    made, tiny = make_law("swing-up", plan.problem, {}, plan.period), 1e-5 * np.array([1.0, -2.0, 3.0, 1.0])
+    goal = made.shaping.goal
+    tau, _ = made(0.0, goal + tiny[:2], tiny[2:], Target(goal, np.zeros(2), np.zeros(2)), made.start())
+    assert tau[0] == pytest.approx(-(K @ tiny)[0], rel=1e-6)
+
+
+def test_a_law_that_plans_has_no_linear_loop_but_does_what_lqr_does():
+    scene = cart("nmpc", goal={"hinge": 0.0})
+    plan = make_plan(scene)
+    with pytest.raises(PantographError, match="'nmpc' has no linear loop: it plans anew"):
+        loop_of(plan, "nmpc", {})
+    made = make_law("nmpc", plan.problem, {"goal": {"hinge": 0.0}, "step": 0.02}, 0.02)
+    _, K, *_ = loop_of(plan, "lqr", {"goal": {"hinge": 0.0}})
+    for x in 1e-4 * np.eye(4):
+        now = Target(*made.clip.evaluate(0.0))
+        tau, _ = made(0.0, x[:2], x[2:], now, made.start())
+        assert tau[0] == pytest.approx(-(K @ x)[0], rel=0.02)
+
+
+def test_a_loop_without_gain_is_drawn_without_warnings(recwarn):
+    s = held(LinearSystem(np.array([[-1.0]]), np.eye(1), ("x",), ("x",)), 0.01)
+    figures.bode(s, [[0.0]]).canvas.draw()
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+
+
+def test_the_command_says_what_no_force_holds_before_it_says_margins(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("cart.toml").write_text(CART.replace("goal = {hinge = 0.0}", ""))
+    cli.gains(Path("cart.toml"))
+    said = capsys.readouterr().out
+    assert said.startswith("note: law 'lqr' regulates about 'hinge' at 0.2 rad, as it starts")
+    cli.gains(Path("cart.toml"), law="pd")
+    assert "note" not in capsys.readouterr().out
+
+
+def test_the_command_looks_at_its_folder_before_it_works(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PantographError, match=r"cannot write into .*file: .*name another folder"):
+        cli.gains(tmp_path / "no-scene.toml", out=tmp_path / "file")

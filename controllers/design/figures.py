@@ -30,7 +30,7 @@ def bode(system: LinearSystem, K: ArrayLike, *, input: int = 0) -> Figure:
     L = loop_response(system, K, w, input=input)
     chart = Figure(figsize=(8, 6), layout="constrained")
     top, bottom = chart.subplots(2, 1, sharex=True)
-    top.semilogx(w, 20.0 * np.log10(np.abs(L)))
+    top.semilogx(w, 20.0 * np.log10(np.abs(L), out=np.full(len(w), np.nan), where=L != 0.0))
     phase = np.degrees(np.unwrap(np.angle(L)))
     if found.stable and np.isfinite(
         found.phase

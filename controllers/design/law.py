@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -22,9 +22,12 @@ from ..reality import LOOP_WORDS, LoopMemory
 from .linear import LinearSystem, held, linearise, linearise_contact
 from .memory import LinearLaw, linear_law, numbers
 
+if TYPE_CHECKING:
+    from ..swing_up import SwingUp
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-_MOST = 200  # numbers of a memory that become states
+_MOST = 2000  # numbers of a memory that become states
 
 
 class LinearLoop(NamedTuple):
@@ -58,8 +61,9 @@ def loop_of(
     differences, contacts and limits included, about the state that a run under the law has at ``t``. K is
     minus the derivative of the law's forces by state and memory, by centred differences of ``step`` [rad, m,
     and per second]. Delays and velocity filters are part of the memory; what else sensors and drives do is
-    left out. Raises PantographError when the scene has nothing to control, for times outside
-    it, and for a run that does not reach ``t``.
+    left out. Of a swing-up the loop is that of its catch about the goal. Raises PantographError when the
+    scene has nothing to control, for times outside it, for a run that does not reach ``t``, and for laws that
+    plan anew at every sample: derivatives at one do not tell what they do.
     """
     problem, period = plan.problem, plan.period
     if period is None:
@@ -69,7 +73,14 @@ def loop_of(
     m = problem.model
     known = law_words(plan.setup.scene, m, words)
     own = {word: value for word, value in known.items() if word not in _left(words)}
+    if law == "nmpc":
+        raise PantographError(
+            "law 'nmpc' has no linear loop: it plans anew at every sample. Where no limit is near it does "
+            "about what LQR with the same weights and goal does: gains --law lqr shows that loop"
+        )
     made = make_law(law, problem, own, period)
+    if law == "swing-up":
+        return _caught(problem, {w: x for w, x in own.items() if w not in LOOP_WORDS}, known, period)
     tracked, keyed = problem.dofs(Role.TRACKED), problem.dofs(Role.KEYED)
     if plan.engine.what == "contact":
         at = _run_to(plan, made, t)
@@ -82,13 +93,26 @@ def loop_of(
         need = Nominal(m).inverse(*at.target)
         mechanism = linearise(m, at.q, at.v, need, inputs=tracked, keyed=keyed, a_keyed=at.target.a)
         says = f"about the keys at t = {t:g} s, by exact derivatives{_left_out(problem)}"
-    left = list(_left(words))
-    if len(numbers(at.memory)) > _MOST:
-        at, left = at._replace(memory=made.start()), [*left, "the law's memory"]
+    if (many := len(numbers(at.memory))) > _MOST:
+        raise PantographError(
+            f"law {law!r} keeps {many} numbers from sample to sample: too many for states of a linear loop"
+        )
+    left = _left(words)
     says += f"; left out of the loop: {', '.join(left)}" if left else ""
     found = _linear(made, at, m, tracked, keyed, step)
     alone = held(mechanism, period)
     return LinearLoop(_with_memory(alone, found), np.hstack([found.K, -found.C]), says, alone)
+
+
+def _caught(problem: Problem, own: dict[str, Any], words: Mapping[str, Any], period: float) -> LinearLoop:
+    """The loop of a swing-up's catch, an LQR about the goal, without sensors and drives."""
+    made = cast("SwingUp", make_law("swing-up", problem, own, period))
+    (catch, _), tracked = made.shaping.catch, problem.dofs(Role.TRACKED)
+    alone = held(linearise(problem.model, made.shaping.goal, inputs=tracked), period)
+    says = "about the goal, where the catch holds the machine, by exact derivatives"
+    left = [word for word in words if word in LOOP_WORDS]
+    says += _left_out(problem) + (f"; left out of the loop: {', '.join(left)}" if left else "")
+    return LinearLoop(alone, catch.regulator.K, says, alone)
 
 
 def _on_keys(problem: Problem, law: Law, own: Mapping[str, Any], t: float, period: float) -> _Point:
