@@ -1,6 +1,7 @@
 """Motion against machines: what is impossible is found, and retimed motion is possible and the fastest."""
 
 import copy
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -487,6 +488,18 @@ def test_check_says_where_and_by_how_much():
 def test_what_cannot_be_helped_is_said(clip, limits, words):
     with pytest.raises(PantographError, match=words):
         retime(clip, machine(ARM, **limits))
+
+
+def test_drives_may_pull_harder_than_they_push():
+    """A weight of 2 g N is held by what pushes up, whatever pulls down."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body>
+        </worldbody></mujoco>"""
+    )
+    clip = Clip(model, {"z": keyed([0, 1], [0.0, 1e-9])}, model.qpos0)
+    for low, high, share in ((-5.0, 40.0, 0.4905), (-40.0, 5.0, 3.924)):
+        able = replace(machine(model, force=1.0), force_low=np.array([low]), force_high=np.array([high]))
+        assert check(clip, able).worst == pytest.approx(share, rel=1e-4)
 
 
 def test_forces_are_those_of_one_state():
