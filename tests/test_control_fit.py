@@ -493,8 +493,8 @@ def test_what_cannot_be_helped_is_said(clip, limits, words):
 def test_drives_may_pull_harder_than_they_push():
     """A weight of 2 g N is held by what pushes up, whatever pulls down."""
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body>
-        </worldbody></mujoco>"""
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1"/>
+        <geom size=".1" mass="2"/></body></worldbody></mujoco>"""
     )
     clip = Clip(model, {"z": keyed([0, 1], [0.0, 1e-9])}, model.qpos0)
     for low, high, share in ((-5.0, 40.0, 0.4905), (-40.0, 5.0, 3.924)):
