@@ -19,10 +19,10 @@ from ..sim.errors import PantographError
 
 console = Console()
 _UNITS = (
-    "Where a scene's angles are degrees, rad, rad/s and rad/s^2 are degrees for hinges, also in --sweep; "
-    "gains stay as listed. Gains, weights and limits are one number for all joints, or one a joint: with "
-    'kp = {elbow = 40}, joints that are not named keep the default; with kp = {"" = 20, elbow = 40}, they '
-    "have what all others have, 20."
+    "Where a scene's angles are degrees, rad, rad/s and rad/s^2 are degrees for hinges, also in --sweep and "
+    "--start; gains stay as listed. Gains, weights and limits are one number for all joints, or one a joint: "
+    'with kp = {elbow = 40}, joints that are not named keep the default; with kp = {"" = 20, elbow = 40}, '
+    "they have what all others have, 20."
 )
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML) with tracked joints.")]
 
@@ -56,14 +56,15 @@ def control(
         list[str] | None, typer.Option(help="Values of a parameter: frequency=2,5,10, or one: site=tip.")
     ] = None,
     trials: Annotated[int, typer.Option(help="Disturbed runs a law.", min=0)] = 8,
-    mass: Annotated[float, typer.Option(help="Masses differ by up to this part.", min=0.0)] = 0.1,
+    mass: Annotated[float, typer.Option(help="Masses differ by up to this part: 0.1 is 10 %.")] = 0.1,
     friction: Annotated[
-        float, typer.Option(help="Damping and dry friction differ by up to this part.", min=0.0, max=1.0)
+        float, typer.Option(help="Damping and dry friction differ by up to this part.")
     ] = 0.0,
-    push: Annotated[
-        float, typer.Option(help="Pushes of up to this part of the drives' force.", min=0.0)
-    ] = 0.2,
-    seed: Annotated[int, typer.Option(help="Of the disturbances.")] = 0,
+    push: Annotated[float, typer.Option(help="Pushes of up to this part of the drives' force.")] = 0.2,
+    start: Annotated[
+        float, typer.Option(help="Starts off by up to this, in the scene's units, and this a second.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of the disturbances.", min=0)] = 0,
     processes: Annotated[int | None, typer.Option(help="Processes; default: all processors.", min=1)] = None,
     table: Annotated[str, typer.Option(help="Kind of the saved tables: csv or parquet.")] = "csv",
     out: Annotated[Path, typer.Option(help="Folder for tables and picture.")] = Path("out"),
@@ -72,9 +73,11 @@ def control(
     ] = False,
 ) -> None:
     """Run a scene under several control laws, as modelled and disturbed, and compare them."""
+    from ..sim.compile.program import workers
     from ..sim.compose import LAWS
     from ..sim.scene.load import load_scene
     from . import experiments, tables
+    from .experiments import printed
     from .trial import ILC
 
     tables.check_format(table)
@@ -84,6 +87,8 @@ def control(
     known = sorted((*LAWS, ILC))
     if unknown := [law for law in chosen if law not in known]:
         raise PantographError(f"no law {unknown[0]!r}; there is: {', '.join(known)}")
+    saved = [out / f"{scene.stem}.{part}" for part in (f"control.{table}", f"runs.{table}", "control.png")]
+    tables.check_outputs(out, saved)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"controlling {scene.stem}", total=None)
@@ -95,27 +100,44 @@ def control(
             mass=mass,
             friction=friction,
             push=push,
+            start=start,
             seed=seed,
-            processes=processes,
+            processes=processes or max(2, workers()),  # apart from this one, which hears Ctrl-C
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    console.print(*_tables(result), sep="\n")
-    for line in _failures(result):
-        console.print(line, soft_wrap=True)
-    for what, rows in (("control", tables.summary(result)), ("runs", tables.runs(result))):
-        console.print(f"table: {tables.save(rows, out / f'{scene.stem}.{what}.{table}')}", soft_wrap=True)
-    pictures = {"control": experiments.figure(result)}
+    if result.rows:
+        console.print(*printed.tables(result), sep="\n")
+    for line in printed.notes(result):
+        console.print(escape(line), soft_wrap=True, highlight=False)
+    if result.status == "interrupted":
+        _leave(result, [path.with_suffix(f".partial{path.suffix}") for path in saved[:2]])
+    for path, rows in zip(saved[:2], (tables.summary(result), tables.runs(result)), strict=True):
+        console.print(f"table: {tables.save(rows, path)}", soft_wrap=True)
+    pictures = {saved[2]: experiments.figure(result)}
     for name, trial in result.trials.items():
         if trial.learned is not None:
             errors = ", ".join(f"{error:.2e}" for error in trial.learned.errors)
             console.print(f"{name}, RMS error of each repeat: {errors}", soft_wrap=True, highlight=False)
             kept = trial.learned.save(out / f"{scene.stem}.{name.replace(' ', '-')}.npz")
             console.print(f"learned forces: {kept} (the controller's word 'learned')", soft_wrap=True)
-            pictures["learning"] = experiments.learning(result)
-    for name, picture in pictures.items():
-        path = out / f"{scene.stem}.{name}.png"
+            pictures[out / f"{scene.stem}.learning.png"] = experiments.learning(result)
+    for path, picture in pictures.items():
         picture.savefig(path, dpi=120)
         console.print(f"picture: {path}", soft_wrap=True)
+    if result.unfit:
+        raise typer.Exit(1)
+
+
+def _leave(result: Any, paths: list[Path]) -> None:
+    """Save what Ctrl-C left of a comparison, and raise it again."""
+    from . import tables
+
+    interrupt = KeyboardInterrupt()
+    interrupt.add_note(f"{result.done} of {result.asked} runs are done")
+    if result.rows:
+        for path, rows in zip(paths, (tables.summary(result), tables.runs(result)), strict=True):
+            interrupt.add_note(str(tables.save(rows, path)))
+    raise interrupt
 
 
 def _swept(texts: list[str]) -> dict[str, list[Any]]:
@@ -138,50 +160,12 @@ def _values(text: str) -> tuple[str, list[Any]]:
 def _value(text: str) -> Any:
     if text in ("true", "false"):
         return text == "true"
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _tables(result: Any) -> tuple[Table, Table]:
-    """How well each law follows, and what it takes."""
-    count = len(result.disturbances)
-    well = _columns("law", "RMS", "max", "worst RMS", "failed", "settling", "overshoot")
-    well.title = f"tracked joints: errors (rad, m), settling (s); worst of {count} disturbed runs"
-    cost = _columns("law", "effort", "work J", "at limit", "build ms", "tick us", "of T")
-    cost.title = "what it takes; processor time of ticks: median, 99 % (of the period T), longest"
-    for row in result.rows:
-        f, name = row.nominal, row.variant.name
-        settled = (
-            "-" if math.isnan(f.settling) else "never" if math.isinf(f.settling) else f"{f.settling:.3f}"
-        )
-        robust = f"{row.robust:.2e}" if count else "-"
-        well.add_row(
-            name, f"{f.rms:.2e}", f"{f.worst:.2e}", robust, str(row.failed), settled, f"{f.overshoot:.1%}"
-        )
-        cost.add_row(
-            name,
-            f"{f.effort:.4g}",
-            f"{f.work:.4g}",
-            f"{f.saturated:.1%}",
-            f"{f.build * 1e3:.3g}",
-            f"{f.tick * 1e6:.0f}, {f.tick99 * 1e6:.0f}, {f.longest * 1e6:.0f}",
-            f"{f.tick99 / row.period:.1%}",
-        )
-    return well, cost
-
-
-def _failures(result: Any, most: int = 8) -> list[str]:
-    """Which runs did not reach their end, and why."""
-    says = ("as modelled", *(d.say for d in result.disturbances))
-    lines = [
-        f"{row.variant.name}, {say}: {figures.message or figures.status}"
-        for row in result.rows
-        for say, figures in zip(says, (row.nominal, *row.disturbed), strict=True)
-        if figures.status != "done"
-    ]
-    return lines if len(lines) <= most else [*lines[:most], f"and {len(lines) - most} more: see the table"]
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
 
 
 def _columns(*heads: str) -> Table:
@@ -210,7 +194,7 @@ def gains(
     from . import design
     from .design import figures
     from .design.law import loop_of
-    from .experiments import _told as told
+    from .experiments import told
 
     check_writable(out)
     loaded = load_scene(scene)

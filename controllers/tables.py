@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib import import_module
@@ -10,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from ..sim.errors import PantographError, unknown
+from ..sim.recording import check_writable
 from .experiments import Comparison
+from .experiments.variants import shown
 
 FORMATS = ("csv", "parquet")
 
@@ -45,9 +48,7 @@ def _plain(value: Any) -> Any:
     """A parameter as one number or text."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, Mapping):
-        return " ".join(f"{k}={v}" for k, v in value.items())
-    return str(value)
+    return shown(value)
 
 
 def check_format(ending: str) -> None:
@@ -56,6 +57,16 @@ def check_format(ending: str) -> None:
         raise PantographError(unknown("kind of table", ending, FORMATS, where="Pantograph"))
     if ending == "parquet":
         _arrow()
+
+
+def check_outputs(folder: Path, paths: Sequence[Path]) -> None:
+    """Raise PantographError when ``paths`` in ``folder`` cannot be written, before work is spent on them."""
+    check_writable(folder)
+    for path in paths:
+        if path.is_dir() or (path.exists() and not os.access(path, os.W_OK)):
+            raise PantographError(
+                f"cannot write {path}: it is {'a folder' if path.is_dir() else 'protected'}"
+            )
 
 
 def save(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:

@@ -2,20 +2,28 @@
 
 import csv
 import dataclasses
+import os
+import re
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from pantograph.controllers import tables
 from pantograph.controllers import trial as trials
 from pantograph.controllers.cli import control
-from pantograph.controllers.experiments import Row, Variant, _disturbances, compare, figure, learning
+from pantograph.controllers.experiments import Row, Spread, Variant, compare, disturbances, figure, learning
+from pantograph.controllers.experiments import comparison as compared
 from pantograph.controllers.gains import force_limits
 from pantograph.controllers.nominal import Nominal
-from pantograph.controllers.trial import Disturbance, _disturbed, run_trial
+from pantograph.controllers.trial import Disturbance, disturbed, run_trial
 from pantograph.sim import PantographError, Scene, make_plan, run
+from pantograph.sim.cli.app import app
+from typer.testing import CliRunner
 
 PENDULUM = {
     "duration": 1.0,
@@ -29,7 +37,7 @@ PENDULUM = {
     ],
     "controller": {"law": "pd", "period": 0.002, "frequency": 3.0},
 }
-TIMES = ("build", "tick", "tick99", "longest")
+TIMES = ("build", "tick", "tick99", "longest", "code")
 
 
 def without_times(figures):
@@ -159,7 +167,7 @@ def test_what_a_law_builds_first_is_no_tick(monkeypatch):
 def test_a_heavier_machine_has_more_inertia_everywhere():
     problem = make_plan(Scene(**PENDULUM | {"models": [{"file": "arm6"}], "keys": [], "roles": {}})).problem
     q = problem.state0.q + 0.3
-    heavy = _disturbed(problem, Disturbance(mass=(1.3,) * problem.model.nbody))
+    heavy = disturbed(problem, Disturbance(mass=(1.3,) * problem.model.nbody))
     rotors = np.diag(problem.model.dof_armature)
     M, more = (Nominal(p.model).mass_matrix(q) - rotors for p in (problem, heavy))
     np.testing.assert_allclose(more, 1.3 * M, rtol=1e-9, atol=1e-12)
@@ -170,7 +178,7 @@ def test_a_heavier_machine_has_more_inertia_everywhere():
 
 def test_disturbances_are_as_large_as_asked():
     plan = make_plan(Scene(**PENDULUM | {"actuators": {"*": "controller"}}))
-    drawn = _disturbances(plan, 60, 0.1, 0.2, 5)
+    drawn = disturbances(plan, Spread(60, seed=5))
     mass, push = np.array([d.mass for d in drawn]), np.array([d.push for d in drawn])
     assert 0.09 < np.abs(mass - 1).max() <= 0.1
     part = np.abs(push) / force_limits(plan.problem.model)[1]
@@ -235,11 +243,11 @@ def swept():
 def test_a_sweep_varies_what_each_law_has(swept):
     result, seen = swept
     assert seen == [(k + 1, 6) for k in range(6)]
-    assert [r.variant.name for r in result.rows] == ["pd frequency=2.0", "pd frequency=8.0", "lqr force=1.0"]
+    assert [r.variant.name for r in result.rows] == ["pd frequency=2", "pd frequency=8", "lqr force=1"]
     assert result.rows[1].nominal.rms < 0.2 * result.rows[0].nominal.rms
     direct = run_trial(make_plan(Scene(**PENDULUM)), "pd", {"frequency": 8.0}, Disturbance())
     assert without_times(direct.figures) == without_times(result.rows[1].nominal)
-    assert result.trials["pd frequency=8.0"].error.shape == direct.error.shape
+    assert result.trials["pd frequency=8"].error.shape == direct.error.shape
     one, two = (
         compare(Scene(**PENDULUM), ["pd"], sweep={"frequency": [2.0, 8.0]}, processes=n) for n in (1, 2)
     )
@@ -283,49 +291,127 @@ def test_parquet_without_its_library_says_what_to_install(swept, tmp_path, monke
 
 
 def test_the_picture_shows_every_law(swept, tmp_path):
+    """Errors, and what each drive gave, signed, with its limits."""
     result, _ = swept
     chart = figure(result)
-    errors, forces, robust = chart.axes
-    assert [text.get_text() for text in errors.get_legend().get_texts()] == [
+    errors, *forces, robust = chart.axes
+    assert [text.get_text() for text in chart.legends[0].get_texts()] == [
         row.variant.name for row in result.rows
     ]
-    for row, line, force in zip(result.rows, errors.lines, forces.lines, strict=True):
+    assert [ax.get_title() for ax in forces] == ["force of shoulder", "force of elbow"]
+    for i, row in enumerate(result.rows):
         trial = result.trials[row.variant.name]
-        np.testing.assert_allclose(line.get_ydata(), np.maximum(np.linalg.norm(trial.error, axis=1), 1e-15))
-        np.testing.assert_allclose(force.get_ydata(), np.linalg.norm(trial.tau, axis=1))
+        size = np.linalg.norm(trial.error, axis=1)
+        np.testing.assert_allclose(errors.lines[i].get_ydata(), np.maximum(size, 1e-15))
+        for k, ax in enumerate(forces):
+            np.testing.assert_array_equal(ax.lines[i].get_ydata(), trial.tau[:, k])
     dots = [float(y) for line in robust.lines for y in line.get_ydata()]
     assert dots == [x for row in result.rows for x in (row.disturbed[0].rms, row.nominal.rms)]
     chart.savefig(tmp_path / "p.png")
 
 
-def test_sensors_of_the_scene_are_for_all_laws_and_its_gains_for_its_own():
+def test_sensors_of_the_scene_are_for_all_laws_and_its_gains_for_those_that_know_them():
     data = PENDULUM | {"controller": PENDULUM["controller"] | {"encoder": 512.0, "observer": "filter"}}
-    result = compare(Scene(**data), ["pd", "lqr"], processes=1)
-    pd, lqr = (row.variant.words for row in result.rows)
-    assert pd == {"frequency": 3.0, "encoder": 512.0, "observer": "filter"}
+    result = compare(Scene(**data), ["pd", "pid", "lqr"], processes=1)
+    pd, pid, lqr = (row.variant.words for row in result.rows)
+    assert pd == pid == {"frequency": 3.0, "encoder": 512.0, "observer": "filter"}
     assert lqr == {"encoder": 512.0, "observer": "filter"}
     exact = compare(Scene(**PENDULUM), ["lqr"], processes=1)
-    assert result.rows[1].nominal.rms > 3 * exact.rows[0].nominal.rms
+    assert result.rows[2].nominal.rms > 3 * exact.rows[0].nominal.rms
 
 
-def test_what_to_do_is_for_all_laws_that_can():
-    scene = Scene(
+def balancing(**controller):
+    """A pole that starts off its goal, on a cart whose keys rest."""
+    return Scene(
         duration=2.0,
         models=[{"file": "cart_pole"}],
         roles={"tracked": ["slide"]},
         keys=[{"joint": "slide", "times": [0], "values": [0]}],
         initial={"position": {"hinge": 0.1}},
-        controller={"law": "lqr", "period": 0.01, "goal": {"hinge": 0.0}, "position": 100.0},
+        controller={"law": "lqr", "period": 0.01, "goal": {"hinge": 0.0}} | controller,
     )
-    result = compare(scene, ["pd", "lqr", "mpc"], processes=1)
-    pd, lqr, mpc = (row.variant.words for row in result.rows)
-    assert pd == {}
-    assert lqr == {"goal": {"hinge": 0.0}, "position": 100.0}
-    assert mpc == {"goal": {"hinge": 0.0}}
+
+
+def test_what_the_scene_tells_its_law_is_for_all_laws_that_know_it():
+    words = {"position": 100.0, "final": 3.0}
+    result = compare(balancing(**words), ["pd", "lqr", "mpc"], processes=1)
+    told = {row.variant.law: row.variant.words for row in result.rows}
+    goal = {"goal": {"hinge": 0.0}}
+    assert told == {"pd": {}, "lqr": goal | words, "mpc": goal | {"position": 100.0}}
     assert all(np.abs(result.trials[law].error[-1]).max() < 0.05 for law in ("lqr", "mpc"))
 
 
-def test_a_law_that_cannot_be_made_is_named_with_what_it_cannot_steer():
+def test_a_goal_counts_under_every_law():
+    """A law that lets the pole fall is no better for keeping the cart."""
+    result = compare(balancing(), ["pd", "lqr"], processes=1)
+    pd, lqr = (row.nominal for row in result.rows)
+    assert (pd.where, result.uncounted) == ("hinge", ())
+    assert pd.worst > 3.0
+    assert pd.settling == np.inf > lqr.settling > 0.0
+    assert pd.overshoot < 0.1 < lqr.overshoot
+    trial = result.trials["pd"]
+    assert trial.joints == ("slide", "hinge")
+    assert np.abs(trial.error[:, 1]).max() <= np.pi  # it turns right round
+    assert pd.rms == pytest.approx(np.sqrt(np.mean(trial.error**2)))
+    free = balancing().model_copy(update={"controller": None})
+    assert compare(free, ["pd"], processes=1).uncounted == ("hinge",)
+
+
+def test_a_slide_beside_a_hinge_settles_at_an_arm_as_long_as_the_model():
+    plan = make_plan(balancing())
+    trial = run_trial(plan, "lqr", {"goal": {"hinge": 0.0}}, Disturbance())
+    band = 0.02 * 0.1 * np.array([plan.problem.model.stat.extent, 1.0])
+    outside = np.flatnonzero((np.abs(trial.error) > band).any(axis=1))
+    assert trial.figures.settling == pytest.approx(trial.t[outside[-1] + 1])
+    beyond = -trial.error[:, 1].min() / 0.1, np.abs(trial.error[:, 0]).max() / (band[0] / 0.02)
+    assert trial.figures.overshoot <= max(beyond)
+
+
+DRIVEN = """<mujoco><worldbody>
+  <body><joint name="lift" type="slide" axis="0 0 1" actuatorfrcrange="-40 30"/>
+    <geom size=".1" mass="2"/>
+    <body><joint name="turn" axis="0 1 0" armature=".05"/><geom size=".05" pos="0 0 -.4" mass=".5"/>
+      <body pos="0 0 -.4"><joint name="bend" axis="0 1 0"/><geom size=".05" pos="0 0 -.3" mass=".3"/></body>
+    </body></body></worldbody>
+  <actuator><motor joint="lift" gear="3" ctrlrange="-20 20"/>
+    <position joint="turn" gear="2" kp="30" kv="1" ctrlrange="-1.5 1.5"/>
+    <general joint="bend" gainprm="4" biastype="affine" biasprm=".1 -2 -.3" forcerange="-1 .7"/></actuator>
+</mujoco>"""
+
+
+def test_forces_are_what_drives_give(tmp_path):
+    """As MuJoCo says of the same controls, of motors and servos and a law that asks for more; what is cut
+    counts, and what is not does not."""
+    (tmp_path / "driven.xml").write_text(DRIVEN)
+    joints = ["lift", "turn", "bend"]
+    for kp, least, most in ((300.0, 0.5, 1.0), (8.0, 0.05, 0.95), (0.5, 0.0, 0.0)):
+        scene = Scene(
+            duration=0.2,
+            rate=500.0,
+            models=[{"file": str(tmp_path / "driven.xml")}],
+            roles={"tracked": joints},
+            actuators={"*": "controller"},
+            physics={"gravity": False},
+            keys=[{"joint": j, "times": [0], "values": [0.6]} for j in joints],
+            initial={"position": dict.fromkeys(joints, 0.3)},
+            controller={"law": "pd", "period": 0.002, "kp": kp, "kd": 1.0},
+        )
+        plan, r = make_plan(scene), run(scene)
+        trial, d = run_trial(plan, "pd", {"kp": kp, "kd": 1.0}, Disturbance()), mujoco.MjData(r.model)
+        assert trial.inputs == tuple(joints)
+        asked = kp * (0.6 - r.q[:-1]) - r.v[:-1]
+        cut = np.zeros(len(trial.t), dtype=bool)
+        for k in range(len(trial.t)):
+            d.qpos[:], d.qvel[:], d.ctrl[:] = r.q[k], r.v[k], r.tick_ctrl[k]
+            mujoco.mj_forward(plan.problem.model, d)
+            np.testing.assert_allclose(trial.tau[k], d.qfrc_actuator, rtol=1e-6, atol=1e-6)
+            cut[k] = np.abs(asked[k] - d.qfrc_actuator).max() > 1e-6
+        assert trial.figures.saturated == pytest.approx(cut.mean(), abs=0.02)
+        assert least <= trial.figures.saturated <= most
+        assert trial.figures.effort == pytest.approx(np.sqrt(np.mean(np.sum(trial.tau**2, axis=1))))
+
+
+def test_a_law_that_cannot_be_made_is_named_with_what_it_cannot_steer_and_the_others_are_measured():
     """A roll axis that nothing drives: no force of the other joints turns it."""
     others = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_pitch"]
     scene = Scene(
@@ -337,9 +423,106 @@ def test_a_law_that_cannot_be_made_is_named_with_what_it_cannot_steer():
         physics={"friction": False, "contacts": "none", "gravity": False},
         controller={"law": "pd"},
     )
+    seen = []
+    result = compare(
+        scene, ["pd", "lqr"], trials=1, processes=1, progress=lambda done, total: seen.append((done, total))
+    )
+    assert [row.variant.name for row in result.rows] == list(result.trials) == ["pd"]
+    assert len(result.rows[0].disturbed) == 1
     message = r"law 'lqr': no regulator exists: no input can steer tool_roll; track, key or damp"
+    assert re.match(message, result.unfit["lqr"])
+    assert seen == [(1, 4), (3, 4), (4, 4)]
     with pytest.raises(PantographError, match=message):
-        compare(scene, ["pd", "lqr"], processes=1)
+        compare(scene, ["lqr"], processes=1)
+
+
+def test_periods_that_do_not_fit_the_step_leave_the_others(tmp_path):
+    data = PENDULUM | {"solver": {"step": 0.001}, "duration": 0.1}
+    result = compare(Scene(**data), ["pd"], sweep={"period": [0.0025, 0.002]}, processes=1)
+    assert [row.period for row in result.rows] == [0.002]
+    assert "no whole multiple of the step" in result.unfit["pd period=0.0025"]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"mass": -1.0}, "mass must be a number >= 0"),
+        ({"mass": 5}, "mass must be below 1, .* less than nothing"),
+        ({"mass": 1.0}, "mass must be below 1"),
+        ({"friction": 2.0}, "friction must be at most 1"),
+        ({"push": np.nan}, "push must be a number"),
+        ({"start": np.inf}, "start must be a number"),
+        ({"start": -0.1}, "start must be a number >= 0"),
+        ({"trials": -1}, "trials must be a whole number >= 0"),
+        ({"trials": 1.5}, "trials must be a whole number"),
+        ({"seed": -1}, "seed must be a whole number >= 0"),
+        ({"processes": 0}, "processes must be a whole number >= 1"),
+        ({"sweep": {"frequency": []}}, "a sweep of 'frequency' is a list of values"),
+        ({"sweep": {"frequency": "25"}}, "a sweep of 'frequency' is a list of values"),
+        ({"sweep": {"period": [-0.1]}}, "period must be a positive"),
+        ({"laws": "pd"}, "laws to compare are a list of names"),
+        ({"laws": []}, "laws to compare are a list of names"),
+        ({"laws": ["pd", "lqr", "pd"]}, "law 'pd' is named twice"),
+        ({"laws": ["pdd"]}, "no law 'pdd'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_the_work(options, says, monkeypatch):
+    monkeypatch.setattr(compared, "run_trial", None)
+    laws = options.get("laws", ["pd"])
+    with pytest.raises(PantographError, match=says):
+        compare(Scene(**PENDULUM), laws, **{k: x for k, x in options.items() if k != "laws"})
+
+
+def test_machines_as_wrong_as_can_be_still_are_machines():
+    """No mass and no damping is negative, whatever the seed."""
+    plan = make_plan(Scene(**PENDULUM))
+    for by in disturbances(plan, Spread(200, mass=0.999, friction=1.0, seed=1)):
+        made = disturbed(plan.problem, by).model
+        assert (made.body_mass[plan.problem.model.body_mass > 0.0] > 0.0).all()
+        assert (made.body_inertia >= 0.0).all()
+        assert (made.dof_damping >= 0.0).all()
+        assert (made.dof_frictionloss >= 0.0).all()
+
+
+def test_equal_values_of_a_sweep_are_one_variant():
+    result = compare(Scene(**PENDULUM), ["pd"], sweep={"frequency": [2, 2.0, 2.5]}, processes=1)
+    assert [row.variant.name for row in result.rows] == ["pd frequency=2", "pd frequency=2.5"]
+
+
+def test_starts_are_as_far_off_as_asked():
+    """Positions and speeds of all joints but keyed ones, in the scene's units, within their ranges; masses
+    and pushes are those of the same seed without."""
+    data = PENDULUM | {"roles": {"tracked": ["shoulder"], "keyed": ["elbow"]}}
+    for unit, angle in ((1.0, "radian"), (np.rad2deg(1.0), "degree")):
+        plan = make_plan(Scene(**data | {"angle": angle}))
+        drawn = disturbances(plan, Spread(60, start=0.1 * unit, seed=5))
+        offset, speed = (np.array([getattr(d, word) for d in drawn]) for word in ("offset", "speed"))
+        for off in (offset, speed):
+            assert 0.09 < np.abs(off[:, 0]).max() <= 0.1 + 1e-12
+            assert not off[:, 1].any()
+        assert np.abs(np.corrcoef(offset[:, 0], speed[:, 0])[0, 1]) < 0.4
+        same = disturbances(plan, Spread(60, seed=5))
+        assert [(d.mass, d.push, d.start) for d in drawn] == [(d.mass, d.push, d.start) for d in same]
+        assert same[0].offset == ()
+    problem = plan.problem
+    there = disturbed(problem, drawn[0]).state0
+    np.testing.assert_allclose(there.q, problem.state0.q + offset[0])
+    np.testing.assert_allclose(there.v, problem.state0.v + speed[0])
+    limited = make_plan(balancing()).problem
+    high = limited.model.jnt_range[0, 1]
+    far = disturbed(limited, Disturbance(offset=(99.0, 99.0))).state0.q
+    np.testing.assert_allclose(far, [high, 99.1])
+    trial = run_trial(make_plan(Scene(**PENDULUM)), "pd", {}, Disturbance(offset=(0.05, 0.0)))
+    assert trial.error[0, 0] == pytest.approx(-0.05)
+
+
+def test_machine_code_is_timed_where_engines_run_it():
+    """Runs of a thousand ticks or more, of laws that are formulas."""
+    short, long = (make_plan(Scene(**PENDULUM | {"duration": s})) for s in (1.0, 2.1))
+    trial = {law: run_trial(long, law, {}, Disturbance()).figures for law in ("pd", "mpc")}
+    assert 0.0 < trial["pd"].code < trial["pd"].tick
+    assert np.isnan(trial["mpc"].code)
+    assert np.isnan(run_trial(short, "pd", {}, Disturbance()).figures.code)
 
 
 def test_a_scene_without_anything_to_control_is_refused():
@@ -393,10 +576,126 @@ curve = "clamped"
     made = [
         "arm.control.csv",
         "arm.control.png",
-        "arm.ilc-repeats=3.0.npz",
+        "arm.ilc-repeats=3.npz",
         "arm.learning.png",
         "arm.runs.csv",
     ]
     assert sorted(p.name for p in Path("o").iterdir()) == made
     with pytest.raises(PantographError, match="no law 'pdd'; there is: computed-torque, ilc, impedance"):
         control(Path("arm.toml"), compare="pdd")
+
+
+ARM = """duration = 2.0
+[[models]]
+file = "planar_2r"
+[roles]
+tracked = ["shoulder", "elbow"]
+[actuators]
+"*" = "off"
+"""
+
+
+def test_outputs_that_cannot_be_written_are_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(compared, "run_trial", None)
+    Path("arm.toml").write_text(ARM)
+    Path("afile").write_text("")
+    Path("o/arm.runs.csv").mkdir(parents=True)
+    Path("o/arm.control.png").mkdir()
+    for options, says in (
+        ({"out": Path("afile")}, "cannot write into afile"),
+        ({"out": Path("afile/deeper")}, "cannot write into afile/deeper"),
+        ({"out": Path("o")}, "cannot write o/arm.runs.csv: it is a folder"),
+        ({"out": Path("o"), "table": "parquet"}, "cannot write o/arm.control.png|need pyarrow"),
+        ({"table": "xls"}, "no kind of table 'xls'"),
+    ):
+        with pytest.raises(PantographError, match=says):
+            control(Path("arm.toml"), compare="pd", **options)
+
+
+def test_the_command_says_what_fits_not_and_ends_with_a_status(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.toml").write_text(ARM.replace('"shoulder", ', "") + "[physics]\ngravity = false\n")
+    one = ["control", "arm.toml", "--compare", "pd,swing-up", "--trials", "0", "--processes", "1"]
+    result = CliRunner().invoke(app, one)
+    assert (result.exit_code, "swing-up: cannot, because" in result.output) == (1, True)
+    assert "pd is told: nothing" in result.output
+    assert "not counted: shoulder" in result.output
+    assert Path("out/arm.control.png").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes on this system")
+@pytest.mark.parametrize("law", ["pd", "ilc"])
+def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, tmp_path):
+    """No traceback, no process left, a table said to be partial, with what all laws have met."""
+    (tmp_path / "arm.toml").write_text(ARM)
+    say = "import sys; from pantograph.sim.cli import main; sys.argv[0] = 'pantograph'; main()"
+    asked = ["control", "arm.toml", "--compare", f"computed-torque,{law}", "--trials", "5000"]
+    begun = subprocess.Popen(
+        [sys.executable, "-c", say, *asked],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while len(_group(begun.pid)) < 4 and begun.poll() is None and time.monotonic() < until:
+        time.sleep(0.05)  # itself, two others, and what cleans up after them
+    time.sleep(3.0)
+    os.killpg(begun.pid, signal.SIGINT)
+    out, error = begun.communicate(timeout=60)
+    assert begun.returncode == 130
+    assert re.fullmatch(r"interrupted; \d+ of 10002 runs are done(; \S+){0,2}\n", error)
+    assert "Traceback" not in out
+    assert not _group(begun.pid)
+    if "PARTIAL" in out:
+        rows = list(csv.DictReader((tmp_path / "out/arm.control.partial.csv").open()))
+        assert len({row["disturbed"] for row in rows}) == 1
+    else:
+        assert " 0 of" in error
+
+
+def _group(group):
+    """Processes of a group that are alive."""
+    found = subprocess.run(["ps", "-eo", "pgid=,stat="], capture_output=True, text=True).stdout.split("\n")
+    rows = [line.split() for line in found if line.split()]
+    return [row for row in rows if row[0] == str(group) and not row[1].startswith("Z")]
+
+
+def test_an_interrupted_comparison_keeps_what_all_laws_have_met(monkeypatch):
+    real, seen = compared.run_trial, []
+
+    def stopped(*arguments):
+        seen.append(arguments)
+        if len(seen) == 8:  # two as modelled, two pairs, and one of the third
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(compared, "run_trial", stopped)
+    scene = Scene(**PENDULUM | {"duration": 0.1})
+    result = compare(scene, ["pd", "lqr"], trials=5, processes=1)
+    assert (result.status, result.done, result.asked) == ("interrupted", 6, 12)
+    assert [len(row.disturbed) for row in result.rows] == [2, 2]
+    assert len(result.disturbances) == 2
+    assert len(tables.runs(result)) == 6
+    seen[:] = range(6)
+    result = compare(scene, ["pd", "lqr"], trials=5, processes=1)
+    assert [row.variant.name for row in result.rows] == ["pd"]
+    assert result.disturbances == ()
+
+
+@pytest.mark.parametrize("law", ["pd", "ilc"])
+def test_ctrl_c_within_a_run_is_no_result_of_it(law, monkeypatch):
+    """Engines return what they have; a comparison must not take it for a run that failed."""
+    calls = []
+
+    class Struck:
+        def start(self):
+            return None
+
+        def __call__(self, t, q, v, target, memory):
+            calls.append(t)
+            if len(calls) > 20:
+                raise KeyboardInterrupt
+            return np.zeros(2), None
+
+    monkeypatch.setattr(trials, "make_law", lambda *arguments: Struck())
+    with pytest.raises(KeyboardInterrupt):
+        run_trial(make_plan(Scene(**PENDULUM)), law, {}, Disturbance())

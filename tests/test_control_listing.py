@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 from pantograph.controllers import cli, tables
-from pantograph.controllers.experiments import _disturbances, compare
+from pantograph.controllers.experiments import Spread, compare, disturbances
 from pantograph.controllers.listing import laws
 from pantograph.controllers.reality import Loop
-from pantograph.controllers.trial import Disturbance, _disturbed
+from pantograph.controllers.trial import Disturbance, disturbed
 from pantograph.sim import PantographError, Scene, make_plan
 from pantograph.sim.cli.app import app
 from pantograph.sim.compose import LAWS, known_words, make_law
@@ -148,13 +148,13 @@ def test_the_period_can_be_swept(tmp_path):
 def test_joints_can_rub_otherwise_than_the_law_believes():
     problem = make_plan(Scene(**SWINGING | {"models": [{"file": "arm6"}], "keys": [], "roles": {}})).problem
     rubs = np.linspace(0.5, 1.5, 6)
-    rough, m = _disturbed(problem, Disturbance(friction=tuple(rubs))).model, problem.model
+    rough, m = disturbed(problem, Disturbance(friction=tuple(rubs))).model, problem.model
     assert m.dof_damping.any() or m.dof_frictionloss.any()
     np.testing.assert_allclose(rough.dof_damping, rubs * m.dof_damping)
     np.testing.assert_allclose(rough.dof_frictionloss, rubs * m.dof_frictionloss)
     np.testing.assert_array_equal(rough.body_mass, m.body_mass)
-    drawn = _disturbances(make_plan(Scene(**SWINGING)), 60, 0.1, 0.2, 5, friction=0.5)
-    same = _disturbances(make_plan(Scene(**SWINGING)), 1, 0.1, 0.2, 5)
+    drawn = disturbances(make_plan(Scene(**SWINGING)), Spread(60, friction=0.5, seed=5))
+    same = disturbances(make_plan(Scene(**SWINGING)), Spread(1, seed=5))
     rubs = np.array([d.friction for d in drawn])
     assert 0.45 < np.abs(rubs - 1).max() <= 0.5
     assert (drawn[0].mass, drawn[0].start) == (same[0].mass, same[0].start)

@@ -170,7 +170,7 @@ observer = "filter"
     [
         ("", {"velocity", "goal", "delay", "observer"}),
         ("lqr", {"velocity", "goal", "delay", "observer"}),
-        ("mpc", {"goal", "delay", "observer"}),
+        ("mpc", {"velocity", "goal", "delay", "observer"}),
         ("pd", {"delay", "observer"}),
     ],
 )
