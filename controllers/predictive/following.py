@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...sim.compile.cache import source
 from ...sim.compile.graph import Graph, Scalar, maximum, minimum
 from ...sim.compile.tape import Tape
-from ...sim.dynamics.laws import LawSizes, LinearFeedback
+from ...sim.dynamics.laws import LawSizes
 from ...sim.dynamics.layout import Layout
 from ...sim.dynamics.tangent import difference
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Following(LinearFeedback):
+class Following:
     """u = clip(u_ref + K (x - x_ref)), with gains K (periods, m, 2 nv) and references of their own in each
     period, on the joint forces of the freedoms ``inputs`` of a model whose controls end with these.
 
@@ -26,9 +26,9 @@ class Following(LinearFeedback):
     least and greatest forces at rest, and 1 / their top speeds.
     """
 
-    inputs: tuple[int, ...] = ()
-    rows: Array | None = None
-    motors: Array | None = None
+    inputs: tuple[int, ...]
+    rows: Array
+    motors: Array
 
     @property
     def key(self) -> str:
@@ -36,22 +36,20 @@ class Following(LinearFeedback):
         return f"following {self.inputs} {source(__file__)}"
 
     def sizes(self, layout: Layout) -> LawSizes:
-        """See :class:`~pantograph.sim.dynamics.laws.CompiledLaw`."""
+        """See :class:`~pantograph.sim.dynamics.laws.GivenLaw`."""
         m = len(self.inputs)
         return LawSizes(layout.nq + layout.nv + m * (1 + 2 * layout.nv), 3 * m, 0)
 
     def references(self, layout: Layout, home: Array, periods: int) -> Array:
         """The rows."""
-        assert self.rows is not None
         return self.rows
 
     def gains(self) -> Array:
         """What motors give."""
-        assert self.motors is not None
         return self.motors
 
     def tape(self, layout: Layout) -> Tape:
-        """See :class:`~pantograph.sim.dynamics.laws.CompiledLaw`."""
+        """See :class:`~pantograph.sim.dynamics.laws.GivenLaw`."""
         graph, m, nq, nv = Graph(), len(self.inputs), layout.nq, layout.nv
         sizes = {"q": nq, "v": nv, "act": layout.na} | dict(zip("rgm", self.sizes(layout), strict=True))
         nodes = {name: graph.inputs(name, size) for name, size in sizes.items()}

@@ -114,7 +114,7 @@ class Shooting:
         for steps, h in ((slice(0, 1), ref.h[0]), (slice(1, n), self.step)):
             if (count := steps.stop - steps.start) == 0:
                 break
-            law = Following(0.0, inputs=inputs, rows=rows[..., steps, :], motors=motors)
+            law = Following(inputs, rows[..., steps, :], motors)
             w = ref.w[steps][:, (0, 1, 1, 2)].reshape(4 * count, -1) if ref.w.shape[2] else None
             path = self.pushed.rollout(states[..., :nq], states[..., nq:], law, step=h, steps=count, w=w)
             X.append(np.concatenate([path.q, path.v], axis=-1)[..., 1:, :])

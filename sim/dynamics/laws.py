@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeGuard
 
 import mujoco
 import numpy as np
@@ -43,6 +43,23 @@ class CompiledLaw(Protocol):
     def tape(self, layout: Layout) -> Tape:
         """The program (q, v, act, r, g, m) -> u, and the new m."""
         ...
+
+
+class GivenLaw(CompiledLaw, Protocol):
+    """A compiled law without memory that brings its numbers along, for rollouts and integrations."""
+
+    def gains(self) -> Array:
+        """The argument g, shape (ng,) or (batch, ng)."""
+        ...
+
+    def references(self, layout: Layout, home: Array, periods: int) -> Array:
+        """The argument r, shape (nr,), (periods, nr) or (batch, periods, nr); `home` is the model's qpos0."""
+        ...
+
+
+def is_law(controls: object) -> TypeGuard[GivenLaw]:
+    """Whether controls are a law; a tenth of the time of an isinstance of the protocol."""
+    return hasattr(controls, "references")
 
 
 @dataclass(frozen=True)

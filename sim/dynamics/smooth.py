@@ -25,7 +25,7 @@ from ..integrate.control import length_of_time, tolerances
 from ..integrate.tableau import Tableau
 from ..integrate.tableaus import DOPRI5, RK4, tableau_of
 from .fields import Parameter, parameter_index
-from .laws import LinearFeedback
+from .laws import is_law
 from .layout import Keyed, Layout, keyed_joints
 from .machine import Machine
 from .motion.adaptive import Spans, adaptive
@@ -202,8 +202,8 @@ class Smooth(Machine):
 
         Joints go through their limits here: a run of a scene stops them (see `differences`).
 
-        `controls` are an array, (nu,), (periods, nu) or (batch, periods, nu); a `LinearFeedback`; or a
-        function (t, q, v) -> u, called from Python at the start of each period. They are held over `hold`
+        `controls` are an array, (nu,), (periods, nu) or (batch, periods, nu); a law, as `LinearFeedback`; or
+        a function (t, q, v) -> u, called from Python at the start of each period. They are held over `hold`
         steps (default: 1, or the whole span for a single row). Every `every` steps the state is recorded.
         `w` prescribes the keyed joints: a row (nw,), or a function of times (n,) -> (n, nw), evaluated at the
         stages' times. `method` is a name of `TABLEAUS` or a tableau. Raises EngineError for shapes that do
@@ -213,7 +213,7 @@ class Smooth(Machine):
         if steps < 1:
             raise EngineError(f"steps={steps} are none: give a positive number of steps")
         if hold is None:
-            sampled = isinstance(controls, LinearFeedback) or callable(controls)
+            sampled = is_law(controls) or callable(controls)
             one_row = not sampled and (controls is None or np.ndim(controls) == 1)  # type: ignore[arg-type]
             hold = steps if one_row else 1
         if hold < 1 or every < 1 or steps % hold or steps % every:

@@ -15,7 +15,7 @@ from ...compile.program import address, in_parallel
 from ...compile.step_control import STATISTICS
 from ...errors import EngineError
 from ...integrate.tableau import Tableau
-from ..laws import CompiledLaw, LinearFeedback
+from ..laws import CompiledLaw, is_law
 from ..layout import Layout
 from .guards import Guards
 from .loops import Loop, compiled_loop, finish
@@ -151,7 +151,7 @@ def adaptive(
     spans = smooth.no_motion if still else Spans(smooth.layout, motion_of(smooth, w, t0, t1, breaks))
     periods = 1 if hold is None else max(1, math.ceil((t1 - t0) / hold - 1e-9))
     h = np.full(len(start.x), first_step or min(t1 - t0, hold or math.inf) * 1e-3)
-    if callable(controls) and not isinstance(controls, LinearFeedback):
+    if callable(controls) and not is_law(controls):
         return _called_back(
             smooth, start, t_eval, spans, h, controls, hold, periods,
             method=method, rtol=rtol, atol=atol, p=p, max_steps=max_steps,

@@ -13,7 +13,7 @@ from ...compile.program import address, in_parallel
 from ...compile.rollout import fixed_steps
 from ...errors import EngineError
 from ...integrate.tableau import Tableau
-from ..laws import CompiledLaw, LinearFeedback
+from ..laws import CompiledLaw, is_law
 from .loops import PARALLEL_OPERATIONS, Loop, compiled_loop, finish
 from .path import Path
 from .rows import (
@@ -55,7 +55,7 @@ def fixed(
     t0: float,
 ) -> Path:
     """See `Smooth.rollout`."""
-    if callable(controls) and not isinstance(controls, LinearFeedback):
+    if callable(controls) and not is_law(controls):
         return _called_back(
             smooth, start, controls, method=method, step=step, steps=steps, hold=hold, every=every,
             w=w, p=p, t0=t0,

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...compile.program import address
 from ...errors import EngineError
-from ..laws import LinearFeedback
+from ..laws import GivenLaw, is_law
 
 if TYPE_CHECKING:
     from ..smooth import Smooth
 
 Array = NDArray[np.float64]
 PythonLaw: TypeAlias = Callable[[float, Array, Array], ArrayLike]
-Controls: TypeAlias = "ArrayLike | LinearFeedback | PythonLaw | None"
+Controls: TypeAlias = "ArrayLike | GivenLaw | PythonLaw | None"
 Prescribed: TypeAlias = "ArrayLike | Callable[[Array], ArrayLike] | None"
 
 NO_MOTION = "keyed joints need their prescribed motion: pass w=(q, v, a) of the keyed joints"
@@ -97,19 +97,19 @@ def per_state(name: str, value: ArrayLike, width: int, count: int) -> Rows:
 
 def control_rows(
     smooth: Smooth, controls: Controls, periods: int, count: int
-) -> tuple[LinearFeedback | None, Rows, Rows]:
+) -> tuple[GivenLaw | None, Rows, Rows]:
     """The compiled law if there is one, its rows (or the controls themselves), and its gains."""
     if controls is None:
         return None, smooth.still, NOTHING
     lay = smooth.layout
-    if isinstance(controls, LinearFeedback):
+    if is_law(controls):
         home = smooth.model.qpos0[lay.q_free]
         references = controls.references(lay, home, periods)
         gains = controls.gains()
         rows = rows_of("references", references, references.shape[-1], periods, count)
         return controls, rows, per_state("K", gains, gains.shape[-1], count)
-    assert not callable(controls)
-    return None, rows_of("controls", controls, lay.nu, periods, count), NOTHING
+    held = cast("ArrayLike", controls)
+    return None, rows_of("controls", held, lay.nu, periods, count), NOTHING
 
 
 def parameter_rows(smooth: Smooth, p: ArrayLike | None, count: int) -> Rows:
