@@ -68,13 +68,14 @@ def _controls(plan: Plan, law: Law | None) -> Sampled | None:
 def _recorded(plan: Plan, segment: Segment, engine: Engine | None, law: Law | None) -> Recording:
     """The recording of a segment, with an error estimate when the ``engine`` for it is given."""
     problem, setup = plan.problem, plan.setup
-    status, message, estimate, notes = segment.status, segment.message, None, [_UNCHECKED]
+    status, message, estimate = segment.status, segment.message, None
+    notes = [*plan.notes, _UNCHECKED]
     missed: dict[str, Array] = {}
     try:
         derived = derive(problem, segment)
         missed = _missed(setup, segment)
-        notes = [*plan.notes, *_sentences(setup, missed, segment.t)]
-        notes += check_frames(setup, segment.t, segment.q)
+        seen = check_frames(setup, segment.t, segment.q)
+        notes = [*plan.notes, *_sentences(setup, missed, segment.t), *seen]
         if engine is not None and status == "done" and segment.stats["steps"]:
             estimate = estimate_error(engine, problem, segment, _controls(plan, law))
     except EngineError as e:
