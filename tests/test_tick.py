@@ -19,6 +19,7 @@ from pantograph.sim.engines.common import Broken
 from pantograph.sim.engines.contact import ContactEngine
 from pantograph.sim.engines.interface import Drive, Problem, Role, State
 from pantograph.sim.engines.smooth import SmoothEngine
+from pantograph.sim.engines.smooth_run import Run
 from pantograph.sim.engines.tick import tick_of
 
 KINDS = {
@@ -255,3 +256,20 @@ def test_encoders_of_keyed_joints_play_no_part():
     machines = (random_machine(seed) for seed in range(99))
     problem = next(m for m in machines if (m.roles == Role.KEYED).any() and len(m.roles) > 2)
     assert_alike(*both(problem, "pd", {"encoder": 100, "backlash": 0.01, "observer": "filter"}))
+
+
+def test_an_interrupt_leaves_no_tick_after_the_last_state(monkeypatch):
+    problem, kept = random_machine(5, joints=("hinge", "hinge")), Run.keep
+    seen = []
+
+    def keep(self, *state):
+        seen.append(state)
+        if len(seen) == 9:
+            raise KeyboardInterrupt
+        kept(self, *state)
+
+    monkeypatch.setattr(Run, "keep", keep)
+    law = make_law("pd", problem, {}, 0.003)
+    ours = SmoothEngine().run(problem, (0.0, problem.duration), Sampled(law, problem, 0.003))
+    assert ours.status == "interrupted"
+    assert ours.tick_t[-1] <= ours.t[-1] < problem.duration

@@ -94,6 +94,12 @@ class Ticks:
         self._close()
         self._blocks.append((t, ctrl, qfrc))
 
+    def forget_after(self, t: float) -> None:
+        """Drop the samples later than ``t`` [s]."""
+        times, ctrl, qfrc = self.arrays()
+        early = times <= t
+        self._blocks = [(times[early], ctrl[early], qfrc[early])]
+
     def arrays(self) -> tuple[Array, Array, Array]:
         """All times (n,), ctrl (n, nu) and qfrc (n, nv)."""
         self._close()

@@ -98,6 +98,7 @@ class Run(ABC):
     def _keep_last(self) -> float:
         """Record the last whole state of a run that was stopped; its time [s]."""
         offset, state, self.resting = self.last
+        self.ticks.forget_after(self.t0 + offset)
         if not (self.samples and self.samples[-1][0] >= self.t0 + offset):
             self.keep(offset, *state)
         return self.t0 + offset
