@@ -125,6 +125,41 @@ def felt_inertia(model: mujoco.MjModel, q: Array) -> Array:
     return np.asarray(1.0 / np.diag(inverse))
 
 
+def coupling(model: mujoco.MjModel, q: Array, tracked: NDArray[np.bool_]) -> float:
+    """How many times its felt inertia a motion of the freedoms ``tracked`` (nv,) together has, at most; 1
+    where no joint drags another along."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    inverse = np.eye(model.nv)
+    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
+    among = inverse[np.ix_(tracked, tracked)]
+    scale = np.sqrt(np.diag(among))
+    return float(1.0 / np.linalg.eigvalsh(among / np.outer(scale, scale)).min(initial=1.0))
+
+
+def falling_stiffness(model: mujoco.MjModel, q: Array, tracked: NDArray[np.bool_]) -> Array:
+    """Stiffness (nv,) [N m/rad, N/m] that keeps the freedoms ``tracked`` (nv,) from falling away from ``q``
+    under weights that are balanced there: D with D + dg/dq >= 0, by diagonal dominance; 0 where all return.
+    """
+    data, columns, step = mujoco.MjData(model), [], 1e-5
+    for unit in step * np.eye(model.nv)[tracked]:
+        ends = []
+        for way in (unit, -unit):
+            data.qpos[:] = q
+            mujoco.mj_integratePos(model, data.qpos, way, 1.0)
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            ends.append((data.qfrc_bias - data.qfrc_passive)[tracked])
+        columns.append((ends[0] - ends[1]) / (2.0 * step))
+    out = np.zeros(model.nv)
+    if columns:
+        gradient = np.column_stack(columns)
+        sizes, ways = np.linalg.eigh(0.5 * (gradient + gradient.T))
+        out[tracked] = np.abs((ways * np.maximum(-sizes, 0.0)) @ ways.T).sum(axis=1)
+    return out
+
+
 def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
     """Least and greatest force (nv,) that the actuators on each freedom can give [N, N m].
 

@@ -19,7 +19,16 @@ from ..sim.dynamics.layout import Layout
 from ..sim.dynamics.tangent import difference as difference_of
 from ..sim.formula import Expressed, Formula, Symbols
 from .drives import Drives
-from .gains import Gain, choice, felt_inertia, per_joint, positive, unit_free_gains
+from .gains import (
+    Gain,
+    choice,
+    coupling,
+    falling_stiffness,
+    felt_inertia,
+    per_joint,
+    positive,
+    unit_free_gains,
+)
 from .nominal import Nominal, difference
 
 Array = NDArray[np.float64]
@@ -37,13 +46,14 @@ class PIDMemory(NamedTuple):
 class PID:
     """PID on the degrees of freedom ``tracked`` (nv,) of ``model``.
 
-    Gains follow from ``frequency`` [Hz] and ``damping`` as for PD, Ki = Kp w / 10; or ``kp`` [N m/rad,
-    N/m], ``ki`` [N m/(rad s), N/(m s)], ``kd`` [N m s/rad, N s/m] are given: one number, or one a joint by
-    name, where joints that are not named have what "" is given, or these. ``filter`` [Hz] is the corner of
-    the velocity filter (default: ten times ``frequency``). ``feedforward``: nothing, the weight at the
-    target, or all forces that the target's motion needs. Beyond what its drives can give, less towards
-    ``top_speed`` [rad/s, m/s], the integral runs back within ``windup`` [s] (default: the geometric mean of
-    Ki/Kp and Kd/Kp times).
+    Gains follow from ``frequency`` [Hz] and ``damping`` as for PD: Kp = m w^2 and as much more as the weight
+    pulls away from ``q0``, for it is compensated at the target only; Ki = m w^3 / 10, less where joints
+    drag each other along so much that it would not be stable. Or ``kp`` [N m/rad, N/m], ``ki`` [N m/(rad s),
+    N/(m s)], ``kd`` [N m s/rad, N s/m] are given: one number, or one a joint by name, where joints that are
+    not named have what "" is given, or these. ``filter`` [Hz] is the corner of the velocity filter (default:
+    ten times ``frequency``). ``feedforward``: nothing, the weight at the target, or all forces that the
+    target's motion needs. Beyond what its drives can give, less towards ``top_speed`` [rad/s, m/s], the
+    integral runs back within ``windup`` [s] (default: the geometric mean of Ki/Kp and Kd/Kp times).
     """
 
     def __init__(
@@ -67,9 +77,13 @@ class PID:
         choice("feedforward", feedforward, _FEEDFORWARD, "the PID law")
         self.model, self.tracked, self.feedforward = model, tracked, feedforward
         kp, ki, kd = ({} if gain is None else gain for gain in (kp, ki, kd))
-        own_kp, own_kd = unit_free_gains(felt_inertia(model, q0), frequency, damping)
-        self.kp = per_joint(model, "the PID law's kp", kp, missing=own_kp, tracked=tracked)
-        self.ki = per_joint(model, "the PID law's ki", ki, missing=self.kp * w / 10.0, tracked=tracked)
+        inertia, falls = felt_inertia(model, q0), falling_stiffness(model, q0, tracked)
+        own, own_kd = unit_free_gains(inertia, frequency, damping)
+        self.kp = per_joint(model, "the PID law's kp", kp, missing=own + falls, tracked=tracked)
+        # half of what Routh allows a motion of all joints together: m s^3 + kd s^2 + kp s + ki
+        rate = w * min(0.1, damping / coupling(model, q0, tracked))
+        own = rate * np.maximum(self.kp - falls, 0.0)
+        self.ki = per_joint(model, "the PID law's ki", ki, missing=own, tracked=tracked)
         self.kd = per_joint(model, "the PID law's kd", kd, missing=own_kd, tracked=tracked)
         corner = 10.0 * frequency if filter is None else positive("the PID law's filter", filter)
         self.lag = 1.0 / (2.0 * np.pi * corner)

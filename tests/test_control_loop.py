@@ -4,13 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pantograph.controllers import cli
 from pantograph.controllers.design import LinearSystem, closed_loop, figures, held, margins
 from pantograph.controllers.design.law import loop_of
+from pantograph.controllers.nominal import Nominal
 from pantograph.sim import PantographError, Scene, make_plan, run
 from pantograph.sim.compose import make_law
 from pantograph.sim.control import Target
 from scipy import linalg
+from strategies import seeds
 
 SLIDE = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
   <geom size=".1" mass="2"/></body></worldbody></mujoco>"""
@@ -246,3 +250,44 @@ def test_the_command_looks_at_its_folder_before_it_works(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(PantographError, match=r"cannot write into .*file: .*name another folder"):
         cli.gains(tmp_path / "no-scene.toml", out=tmp_path / "file")
+
+
+def neck(n, heights, rng):
+    """n joints on one spot, as of a neck that carries a head: each drags all others along."""
+    axes = rng.normal(size=(n, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    text, close = "", ""
+    for i, axis in enumerate(axes):
+        text += f"""<body pos="0 0 {0.01 * i}"><joint name="j{i}" axis="{axis[0]} {axis[1]} {axis[2]}"
+          damping=".02"/><geom size=".01" mass=".05"/>"""
+        close += "</body>"
+    text += f'<geom type="box" size=".06 .09 .05" pos=".02 0 {heights}" mass="2"/>'
+    return f"<mujoco><worldbody>{text}{close}</worldbody></mujoco>"
+
+
+@given(seeds, st.integers(1, 3), st.sampled_from([-0.3, 0.1, 0.3, 0.6]), st.sampled_from([0.3, 1.0, 2.0]))
+@settings(max_examples=30, deadline=None)
+def test_gains_that_a_pid_law_chooses_are_stable(tmp_path_factory, seed, n, height, damping):
+    """Also above their joints, where weight pulls away, and of joints that drag each other along."""
+    path = tmp_path_factory.mktemp("neck") / "neck.xml"
+    path.write_text(neck(n, height, np.random.default_rng(seed)))
+    scene = Scene(
+        duration=1.0,
+        models=[{"file": str(path)}],
+        roles={"tracked": ["j*"]},
+        physics={"contacts": "none"},
+        controller={"law": "pid", "period": 0.001, "damping": damping},
+    )
+    system, K, *_ = loop_of(make_plan(scene), "pid", {"damping": damping})
+    assert margins(system, K).stable
+
+
+def test_a_pid_law_of_one_joint_that_hangs_has_the_gains_of_a_pd_law():
+    words = {"duration": 1.0, "models": [{"file": "pendulum"}], "roles": {"tracked": ["hinge"]}}
+    problem = make_plan(Scene(**words)).problem
+    pd, pid = (make_law(law, problem, {}) for law in ("pd", "pid"))
+    np.testing.assert_allclose([pid.kp, pid.kd], [pd.kp, pd.kd])
+    np.testing.assert_allclose(pid.ki, pid.kp * np.pi)
+    up = make_plan(Scene(**words, initial={"position": {"hinge": np.pi}})).problem
+    weight = Nominal(up.model).weight(np.array([np.pi / 2]))
+    np.testing.assert_allclose(make_law("pid", up, {}).kp - pd.kp, np.abs(weight), rtol=1e-6)
