@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models import dof_names
+from ..models import dof_names, joint_names
 from ..sim.compose import make_engine, make_law
 from ..sim.control import Law, Sampled, Target
 from ..sim.engines.common import Broken
@@ -27,6 +27,7 @@ from .ilc import Fed, Learned, learn
 from .judged import Judged, delivered, judged
 from .nominal import moved
 from .reality import LOOP_WORDS, Loop, LoopMemory, with_reality
+from .swing_up import SwingUp
 
 Array = NDArray[np.float64]
 ILC = "ilc"  # no law of its own: another one that learns
@@ -203,7 +204,7 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     problem, period, scene = plan.problem, plan.period, plan.setup.scene
     assert period is not None
     words = law_words(scene, problem.model, words)
-    aims = judged(problem, words.get("goal", law_words(scene, problem.model).get("goal")))
+    aims = judged(problem, _goal(plan, words))
     begun, learned = time.perf_counter(), None
     true, engine = disturbed(problem, disturbance), _Interrupted(make_engine(plan.engine.what))
     if law == ILC:
@@ -227,6 +228,20 @@ def run_trial(plan: Plan, law: str, words: Mapping[str, Any], disturbance: Distu
     trial = _measured(problem, aims, watched, controls.given(watched), build, segment)
     code = _code_time(Sampled(made, true, period), watched.seen) if disturbance == Disturbance() else np.nan
     return replace(trial, learned=learned, figures=replace(trial.figures, code=code))
+
+
+def _goal(plan: Plan, words: Mapping[str, Any]) -> Any:
+    """The goal [rad, m] of these words of a law, else of the scene's own controller; in the scene of a
+    swing-up its goal for every joint, whether or not keys move it."""
+    scene, problem, period = plan.setup.scene, plan.problem, plan.period
+    own = law_words(scene, problem.model)
+    goal = words.get("goal", own.get("goal"))
+    if scene.controller is None or scene.controller.law != "swing-up" or period is None:
+        return goal
+    law = make_law("swing-up", problem, {"goal": goal}, period)
+    assert isinstance(law, SwingUp)
+    names, at, home = joint_names(problem.model), problem.model.jnt_qposadr, law.shaping.goal
+    return {n: float(home[at[j]]) for j, n in enumerate(names) if problem.roles[j] != Role.KEYED}
 
 
 def _learned(

@@ -357,6 +357,22 @@ def test_a_goal_counts_under_every_law():
     assert compare(free, ["pd"], processes=1).uncounted == ("hinge",)
 
 
+@pytest.mark.parametrize("words", [{}, {"goal": {"elbow": 0.0}}, {"delay": 0.01}])
+def test_a_swing_up_is_judged_by_its_own_goal_and_not_by_the_keys_that_it_leaves(words):
+    """Hanging down is no success, of no law; and where it turned round is home."""
+    keys = [{"joint": "elbow", "times": [0, 1.0], "values": [0, 0.5]}]
+    own = {"law": "swing-up", "period": 0.01, "foresight": 0.0} | words
+    scene = Scene(
+        duration=1.0, models=[{"file": "acrobot"}], roles={"tracked": ["elbow"]}, keys=keys, controller=own
+    )
+    result = compare(scene, ["swing-up", "pd"], processes=1)
+    assert result.uncounted == ()
+    for trial in result.trials.values():
+        assert trial.joints == ("shoulder", "elbow")
+        np.testing.assert_allclose(np.abs(trial.error[0]), [np.pi, 0.0], atol=1e-9)
+    assert result.rows[1].nominal.settling == np.inf
+
+
 def test_a_slide_beside_a_hinge_settles_at_an_arm_as_long_as_the_model():
     plan = make_plan(balancing())
     trial = run_trial(plan, "lqr", {"goal": {"hinge": 0.0}}, Disturbance())
@@ -625,10 +641,11 @@ def test_the_command_says_what_fits_not_and_ends_with_a_status(tmp_path, monkeyp
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes on this system")
-@pytest.mark.parametrize("law", ["pd", "ilc"])
-def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, tmp_path):
-    """No traceback, no process left, a table said to be partial, with what all laws have met."""
-    (tmp_path / "arm.toml").write_text(ARM)
+@pytest.mark.parametrize(("law", "seconds"), [("pd", 2), ("ilc", 2), ("pd", 20000)])
+def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, seconds, tmp_path):
+    """No traceback, no process left, also within a run that would take hours, and a table said to be
+    partial, with what all laws have met."""
+    (tmp_path / "arm.toml").write_text(ARM.replace("2.0", f"{seconds}.0"))
     say = "import sys; from pantograph.sim.cli import main; sys.argv[0] = 'pantograph'; main()"
     asked = ["control", "arm.toml", "--compare", f"computed-torque,{law}", "--trials", "5000"]
     begun = subprocess.Popen(
@@ -636,7 +653,11 @@ def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, tmp_path):
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     until = time.monotonic() + 60
-    while len(_group(begun.pid)) < 4 and begun.poll() is None and time.monotonic() < until:
+    while (
+        len(_group(begun.pid)) < (4 if seconds == 2 else 3)
+        and begun.poll() is None
+        and time.monotonic() < until
+    ):
         time.sleep(0.05)  # itself, two others, and what cleans up after them
     time.sleep(3.0)
     os.killpg(begun.pid, signal.SIGINT)
@@ -644,7 +665,7 @@ def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, tmp_path):
     assert begun.returncode == 130
     assert re.fullmatch(r"interrupted; \d+ of 10002 runs are done(; \S+){0,2}\n", error)
     assert "Traceback" not in out
-    assert not _group(begun.pid)
+    _gone(begun.pid)
     if "PARTIAL" in out:
         rows = list(csv.DictReader((tmp_path / "out/arm.control.partial.csv").open()))
         assert len({row["disturbed"] for row in rows}) == 1
@@ -652,11 +673,35 @@ def test_ctrl_c_ends_a_comparison_at_once_with_what_is_done(law, tmp_path):
         assert " 0 of" in error
 
 
+def _gone(group):
+    """No process of a group is left, or only for the moment that ending takes."""
+    until = time.monotonic() + 10
+    while _group(group) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not _group(group)
+
+
 def _group(group):
     """Processes of a group that are alive."""
     found = subprocess.run(["ps", "-eo", "pgid=,stat="], capture_output=True, text=True).stdout.split("\n")
     rows = [line.split() for line in found if line.split()]
     return [row for row in rows if row[0] == str(group) and not row[1].startswith("Z")]
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes on this system")
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    (tmp_path / "arm.toml").write_text(ARM.replace("2.0", "20000.0"))
+    say = "import sys; from pantograph.sim.cli import main; sys.argv[0] = 'pantograph'; main()"
+    begun = subprocess.Popen(
+        [sys.executable, "-c", say, "control", "arm.toml"], cwd=tmp_path, start_new_session=True
+    )
+    until = time.monotonic() + 60
+    while len(_group(begun.pid)) < 3 and time.monotonic() < until:
+        time.sleep(0.05)
+    time.sleep(3.0)
+    begun.kill()
+    begun.wait()
+    _gone(begun.pid)
 
 
 def test_an_interrupted_comparison_keeps_what_all_laws_have_met(monkeypatch):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 _PANELS = 6  # of forces, a joint each
-_DEEP = 0.02  # parts of the samples below and above what a logarithmic axis of errors shows
+_DEEP = 0.02  # part of the samples below what a logarithmic axis of errors shows
 
 
 def figure(comparison: Comparison) -> Figure:
@@ -69,17 +69,18 @@ def _look(i: int) -> dict[str, Any]:
     """Colour and stroke of the ``i``-th law: equal motions stay both visible."""
     from matplotlib import colormaps
 
-    return {"color": colormaps["tab10"](i % 10), "ls": ("-", "--", ":")[i % 3], "lw": 1.3}
+    return {"color": colormaps["tab10"](i % 10), "ls": ("-", "--", ":")[i % 3], "lw": 1.2}
 
 
 def _errors(ax: Axes, comparison: Comparison, joints: tuple[str, ...]) -> None:
-    floor = np.inf
+    floor, most = np.inf, 0.0
     for i, row in enumerate(comparison.rows):
         trial = comparison.trials[row.variant.name]
         size = np.maximum(np.sqrt(np.sum(trial.error**2, axis=1)), 1e-15)
         ax.semilogy(trial.t, size, label=row.variant.name, **_look(i))
-        floor = min(floor, float(np.percentile(size, 100 * _DEEP)))
-    ax.set_ylim(bottom=floor)
+        floor, most = min(floor, float(np.percentile(size, 100 * _DEEP))), max(most, float(size.max()))
+    if most > floor:
+        ax.set_ylim(floor, most * (most / floor) ** 0.05)
     names = ", ".join(joints) if len(joints) <= _PANELS else f"{len(joints)} joints"
     ax.set_ylabel("error [rad, m]")
     ax.set_title(f"error of {names}", fontsize=10)

@@ -53,7 +53,7 @@ def notes(result: Comparison) -> Iterator[str]:
         yield f"errors are of {', '.join(joints)}; largest: {largest}"
     if result.uncounted:
         left = ", ".join(result.uncounted[:_MOST]) + (", ..." if len(result.uncounted) > _MOST else "")
-        yield f"not counted: {left}: no keys, no goal (the controller's word 'goal' gives one)"
+        yield f"not counted: {left}: no keys, no goal (a word of laws such as lqr and mpc)"
     codes = [(r.variant.name, r.nominal.code) for r in result.rows if not math.isnan(r.nominal.code)]
     if codes:
         times = ", ".join(f"{name} {code * 1e6:.2g} us" for name, code in codes[:_MOST])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context, resource_tracker
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from threading import Thread
 from typing import Any, TypeVar
 
 J = TypeVar("J")
@@ -32,7 +34,7 @@ class Crew:
         self._others = set(active_children())
         if processes > 1:
             self._pool = ProcessPoolExecutor(
-                processes, mp_context=get_context("spawn"), initializer=begin, initargs=given
+                processes, mp_context=get_context("spawn"), initializer=_begin, initargs=(begin, given)
             )
 
     def __enter__(self) -> Crew:
@@ -65,6 +67,19 @@ class Crew:
             self._pool = None
         for job in left:
             yield job, here(job)
+
+
+def _begin(begin: Callable[..., None], given: tuple[Any, ...]) -> None:
+    """Begin in a process that ends with the one that started it, however that ends."""
+    Thread(target=_end_with_parent, daemon=True).start()
+    begin(*given)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
