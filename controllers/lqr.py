@@ -30,6 +30,8 @@ from .nominal import Nominal, difference
 from .preview import Preview, aimed
 
 Array = NDArray[np.float64]
+POSITION, VELOCITY = 400.0, 1.0
+"""Weights of deviations, also of joints that are not named."""
 
 
 class Solution(NamedTuple):
@@ -79,8 +81,8 @@ class LQR:
         duration: float,
         keyed: NDArray[np.bool_],
         *,
-        position: Gain = 400.0,
-        velocity: Gain = 1.0,
+        position: Gain = POSITION,
+        velocity: Gain = VELOCITY,
         force: Gain | None = None,
         goal: Mapping[str, float] | None = None,
         final: float | None = None,
@@ -93,8 +95,8 @@ class LQR:
         self.nominal = Nominal(model)
         moving = ~keyed
         state = [
-            per_joint(model, "the LQR's position", position),
-            per_joint(model, "the LQR's velocity", velocity),
+            per_joint(model, "the LQR's position", position, missing=POSITION),
+            per_joint(model, "the LQR's velocity", velocity, missing=VELOCITY),
         ]
         self.Q = np.diag(np.concatenate([weight[moving] for weight in state])) * period
         weight = self.nominal.weight(q0)

@@ -116,9 +116,7 @@ def numbered():
             continue
         for p in inspect.signature(find()).parameters.values():
             if p.kind == p.KEYWORD_ONLY and "Gain" in str(p.annotation) and isinstance(p.default, float):
-                late = name in ("lqr", "mpc", "nmpc") and p.name in ("position", "velocity")
-                why = "weights of joints that are not named are zero there, not the default"
-                yield pytest.param(name, p.name, p.default, marks=[pytest.mark.xfail(reason=why)] * late)
+                yield name, p.name, p.default
 
 
 @pytest.mark.parametrize(("law", "word", "default"), list(numbered()))

@@ -19,7 +19,7 @@ from ...sim.clip import Clip
 from ...sim.control import Target
 from ..drives import Drives
 from ..gains import Gain, limit_per_joint, positive, whole
-from ..lqr import LQR
+from ..lqr import LQR, POSITION, VELOCITY
 from .quadratic import NOTHING, LeastChange, Rows
 
 Array = NDArray[np.float64]
@@ -79,8 +79,8 @@ class MPC:
         *,
         horizon: float = 0.5,
         fine: int = 8,
-        position: Gain = 400.0,
-        velocity: Gain = 1.0,
+        position: Gain = POSITION,
+        velocity: Gain = VELOCITY,
         force: Gain | None = None,
         goal: Mapping[str, float] | None = None,
         slew: Gain | None = None,

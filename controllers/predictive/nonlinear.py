@@ -25,7 +25,7 @@ from ..design.linear import held_matrices, linearise_path
 from ..design.riccati import Regulator
 from ..drives import Drives
 from ..gains import Gain, force_weights, per_joint, positive, whole
-from ..lqr import regulator
+from ..lqr import POSITION, VELOCITY, regulator
 from ..nominal import Nominal
 from ..preview import aimed
 from .shooting import Horizon, Plan, Shooting, Weights
@@ -64,8 +64,8 @@ class NMPC:
         *,
         horizon: float = 1.0,
         step: float = 0.02,
-        position: Gain = 400.0,
-        velocity: Gain = 1.0,
+        position: Gain = POSITION,
+        velocity: Gain = VELOCITY,
         force: Gain | None = None,
         goal: Mapping[str, float] | None = None,
         soft: float = 100.0,
@@ -79,8 +79,8 @@ class NMPC:
         self.n = max(1, round(positive("the NMPC's horizon", horizon) / self.step))
         self.nominal, self.inputs, free = Nominal(model), np.flatnonzero(tracked), ~keyed
         weights = [
-            per_joint(model, f"the NMPC's {word}", gain)[free]
-            for word, gain in (("position", position), ("velocity", velocity))
+            per_joint(model, f"the NMPC's {word}", gain, missing=missing)[free]
+            for word, gain, missing in (("position", position, POSITION), ("velocity", velocity, VELOCITY))
         ]
         self.drives = Drives(model, tracked, top_speed=top_speed)
         self.Q = np.concatenate(weights) * self.step
