@@ -292,10 +292,8 @@ def _elsewhere(problem: Problem, by: Disturbance) -> State:
     q = moved(m, state.q, offset)
     ranged = np.flatnonzero(np.isin(m.jnt_type, SCALAR) & m.jnt_limited.astype(bool))
     at = m.jnt_qposadr[ranged]
-    low, high = (
-        np.array(f(state.q[at], m.jnt_range[ranged, i])) for i, f in enumerate((np.minimum, np.maximum))
-    )
-    q[at] = np.clip(q[at], low, high)
+    low, high = m.jnt_range[ranged].T
+    q[at] = np.clip(q[at], np.minimum(low, state.q[at]), np.maximum(high, state.q[at]))
     return State(q, state.v + speed, state.act)
 
 

@@ -19,10 +19,12 @@ from pantograph.controllers.cli import control
 from pantograph.controllers.experiments import Row, Spread, Variant, compare, disturbances, figure, learning
 from pantograph.controllers.experiments import comparison as compared
 from pantograph.controllers.gains import force_limits
+from pantograph.controllers.judged import judged
 from pantograph.controllers.nominal import Nominal
 from pantograph.controllers.trial import Disturbance, disturbed, run_trial
 from pantograph.sim import PantographError, Scene, make_plan, run
 from pantograph.sim.cli.app import app
+from pantograph.sim.scene.schema.scene import Initial
 from typer.testing import CliRunner
 
 PENDULUM = {
@@ -373,6 +375,21 @@ def test_a_swing_up_is_judged_by_its_own_goal_and_not_by_the_keys_that_it_leaves
     assert result.rows[1].nominal.settling == np.inf
 
 
+def test_a_slide_that_has_nothing_to_do_is_judged_by_what_the_hinge_does():
+    """By itself, at an arm as long as the model: it settles later than the hinge, and swings beyond."""
+    problem = make_plan(balancing()).problem
+    aims, extent = judged(problem, {"hinge": 0.0}), problem.model.stat.extent
+    t = np.arange(100) * 0.01
+    error = np.column_stack([np.where(t < 0.5, 0.03, 0.019) * 0.1 * extent, np.where(t < 0.2, -0.1, 0.0)])
+    error[0, 0] = 0.0
+    q, v = aims.targets(np.zeros((100, 2)), np.zeros((100, 2)))
+    settling, overshoot = aims.arrival(t, error, q, v)
+    assert settling == pytest.approx(0.5)
+    assert overshoot == 0.0
+    error[60:, 0] *= 1.1
+    assert aims.arrival(t, error, q, v)[0] == np.inf
+
+
 def test_a_slide_beside_a_hinge_settles_at_an_arm_as_long_as_the_model():
     plan = make_plan(balancing())
     trial = run_trial(plan, "lqr", {"goal": {"hinge": 0.0}}, Disturbance())
@@ -425,6 +442,11 @@ def test_forces_are_what_drives_give(tmp_path):
         assert trial.figures.saturated == pytest.approx(cut.mean(), abs=0.02)
         assert least <= trial.figures.saturated <= most
         assert trial.figures.effort == pytest.approx(np.sqrt(np.mean(np.sum(trial.tau**2, axis=1))))
+    far = scene.model_copy(update={"initial": Initial(position={"turn": 0.9, "lift": 0.6, "bend": 0.6})})
+    held = run_trial(make_plan(far), "pd", {"kp": 0.5, "kd": 0.0}, Disturbance())
+    cut = ~np.isclose(0.5 * held.error, held.tau, atol=1e-9)  # a servo cannot be told where it stands
+    assert held.figures.saturated == cut.any(axis=1).mean()
+    assert cut[:, 1].mean() > 0.2
 
 
 def test_a_law_that_cannot_be_made_is_named_with_what_it_cannot_steer_and_the_others_are_measured():
@@ -524,6 +546,9 @@ def test_starts_are_as_far_off_as_asked():
     there = disturbed(problem, drawn[0]).state0
     np.testing.assert_allclose(there.q, problem.state0.q + offset[0])
     np.testing.assert_allclose(there.v, problem.state0.v + speed[0])
+    pushed = disturbed(problem, Disturbance(offset=(0.1, 0.1), speed=(0.2, 0.2))).state0
+    np.testing.assert_allclose(pushed.q - problem.state0.q, [0.1, 0.0])
+    np.testing.assert_allclose(pushed.v - problem.state0.v, [0.2, 0.0])
     limited = make_plan(balancing()).problem
     high = limited.model.jnt_range[0, 1]
     far = disturbed(limited, Disturbance(offset=(99.0, 99.0))).state0.q
