@@ -19,7 +19,7 @@ from .kinds import SCALAR
 
 _CHUNK = 1024  # ticks whose targets are evaluated at once
 
-_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _AFFINE_BIAS = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
@@ -52,13 +52,14 @@ class Sampled:
     """A law sampled every ``period`` seconds, its forces delivered through the model's actuators.
 
     A tracked joint with an actuator in the drive ``controller`` gets its force from it, within the limits
-    of the actuator; one without gets it as an ideal joint force.
+    of the actuator; one without gets it as an ideal joint force, unless a servo moves it along its keys.
     """
 
     def __init__(self, law: Law, problem: Problem, period: float) -> None:
         self.law, self.period = law, period
         self.clip: Clip = problem.clip
-        self.tracked = problem.dofs(Role.TRACKED)
+        by_servo = np.isin(problem.model.dof_jntid, list(keyed_by_servo(problem.model, problem.drives)))
+        self.tracked = problem.dofs(Role.TRACKED) & ~by_servo
         self.actuators = controlled_actuators(problem.model, problem.drives)
         self.memory = law.start()
         self.lost = getattr(law, "lost", None)
@@ -171,9 +172,19 @@ def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> Joi
     )
 
 
+def keyed_by_servo(model: mujoco.MjModel, drives: NDArray[np.int8]) -> set[int]:
+    """Joints that an actuator of their own moves by keys, and none by the controller."""
+    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
+    keyed, controlled = (
+        set(model.actuator_trnid[on_joint & (drives == drive), 0].tolist())
+        for drive in (Drive.KEYS, Drive.CONTROLLER)
+    )
+    return keyed - controlled
+
+
 def why_not_controllable(model: mujoco.MjModel, i: int) -> str:
     """Why a controller cannot drive actuator ``i``; empty when it can."""
-    if int(model.actuator_trntype[i]) not in _ON_JOINT:
+    if int(model.actuator_trntype[i]) not in ON_JOINT:
         return "it does not act on one joint"
     joint = int(model.actuator_trnid[i, 0])
     if int(model.jnt_type[joint]) not in SCALAR:

@@ -10,10 +10,10 @@ import numpy as np
 
 from ..models import dof_names, name_of
 from .checks import keys_beyond_limits
-from .control import why_not_controllable
+from .control import ON_JOINT, keyed_by_servo, why_not_controllable
 from .engines.interface import Array, Drive, Problem, Role
 from .kinds import FREE, SCALAR, SLIDE
-from .needs import ON_JOINT, Needs, keyed_by_servo
+from .needs import Needs
 from .scene.build import Setup
 from .scene.live import samples
 
@@ -92,7 +92,7 @@ def cautions(setup: Setup, law: str, words: Mapping[str, Any]) -> list[str]:
 def ideal_drives(setup: Setup) -> list[str]:
     """Tracked joints that get ideal forces, without any limit, although actuators act on them: which, why,
     and what would give them their limits."""
-    m, by_servo = setup.model, keyed_by_servo(setup)
+    m, by_servo = setup.model, keyed_by_servo(setup.model, setup.drives)
     acts = _moments(m, setup.state0.q) != 0.0
     found: dict[str, tuple[list[str], list[str]]] = {}
     for joint in np.flatnonzero(setup.roles == Role.TRACKED):

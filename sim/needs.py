@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import mujoco
 import numpy as np
 
 from ..models import name_of
+from .control import keyed_by_servo
 from .engines.interface import Array, Drive, Role
 from .engines.stiffness import Look, fastest_rate
 from .engines.touch import can_touch
 from .kinds import SCALAR
 from .scene.build import Setup
 
-ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _DEFAULT_PERIOD = 0.002  # s; period of the controller of tracked joints when the scene names none
 _STIFF = 1.75  # rate times step; RK4 is stable up to 2.78, of which smoothed dry friction may take 1
 _LOOKS = 5  # moments of the keys at which springs and servos are looked at
@@ -43,7 +42,7 @@ class Needs:
         """The controller's period [s] when something needs a controller."""
         setup = self.setup
         tracked = setup.roles == Role.TRACKED
-        by_servo = keyed_by_servo(setup)
+        by_servo = keyed_by_servo(setup.model, setup.drives)
         needed = [j for j in np.flatnonzero(tracked) if int(j) not in by_servo]
         if not needed and not (setup.drives == Drive.CONTROLLER).any():
             return None
@@ -105,10 +104,3 @@ class Needs:
     def stiff(self) -> str:
         """What is fastest, in words."""
         return f"springs, dampers or servos at {self.fastest:.3g} rad/s"
-
-
-def keyed_by_servo(setup: Setup) -> set[int]:
-    """Joints that an actuator of their own moves by keys."""
-    m = setup.model
-    own = (setup.drives == Drive.KEYS) & np.isin(m.actuator_trntype, ON_JOINT)
-    return {int(j) for j in m.actuator_trnid[own, 0]}

@@ -273,3 +273,22 @@ def test_an_interrupt_leaves_no_tick_after_the_last_state(monkeypatch):
     ours = SmoothEngine().run(problem, (0.0, problem.duration), Sampled(law, problem, 0.003))
     assert ours.status == "interrupted"
     assert ours.tick_t[-1] <= ours.t[-1] < problem.duration
+
+
+def test_a_servo_along_keys_gets_no_help_from_the_controller():
+    """Of two tracked hinges one has a servo that follows its keys: only the other is the law's."""
+    xml = """<mujoco><worldbody>
+      <body name="a"><joint name="a" axis="0 1 0"/><geom size="0.1" mass="1" pos="0.3 0 0"/>
+        <body pos="0.6 0 0"><joint name="b" axis="0 1 0"/><geom size="0.1" mass="1" pos="0.3 0 0"/></body>
+      </body></worldbody><actuator><position name="s" joint="b" kp="50" kv="5"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    clip = Clip(model, {j: keyed([0.0, 0.1], [[0.0], [0.2]], kind="clamped") for j in "ab"}, model.qpos0)
+    tracked = np.full(2, Role.TRACKED, dtype=np.int8)
+    problem = Problem(
+        model=model, state0=State(model.qpos0, np.zeros(2), np.zeros(0)), duration=0.1, roles=tracked,
+        clip=clip, integrator="rk4", step=0.001, sample_every=10,
+        drives=np.array([Drive.KEYS], dtype=np.int8), servo={0: lambda t: clip.evaluate(t).q[:, 1]},
+    )  # fmt: skip
+    ours, theirs = both(problem, "pd", {})
+    assert_alike(ours, theirs)
+    assert np.abs(ours.tick_qfrc[:, 0]).min() > 0 and not ours.tick_qfrc[:, 1].any()
