@@ -124,7 +124,8 @@ class Loop:
         if observer == "filter":
             self.observer = VelocityFilter(model, q0, corner=corner)
         elif observer != "none":
-            spread = self._rounding() if noise is None else noise
+            rounding = self._rounding()
+            spread = rounding if noise is None else per_joint(model, "noise", noise, missing=rounding)
             self.observer = Kalman(
                 model, q0, self.keyed, noise=spread, push=push, extended=observer == "extended"
             )

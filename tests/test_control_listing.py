@@ -127,6 +127,15 @@ def test_naming_a_joint_leaves_the_others_at_the_default(two, law, word, default
     np.testing.assert_array_equal(same[2], same[0])
 
 
+def test_noise_of_joints_that_are_not_named_is_what_their_encoders_round_away(two):
+    loop = [
+        make_law("pd", two, {"observer": "kalman", "encoder": 1000, **more})
+        for more in ({}, {"noise": {"a": 0.01}})
+    ]
+    own, named = (x.observer.noise for x in loop)
+    np.testing.assert_array_equal(named, [0.01, own[1]])
+
+
 def test_values_of_a_parameter_given_apart_belong_together():
     texts = ["delay=0.004", "frequency=2", "delay=0.01,0.004"]
     assert cli._swept(texts) == {"delay": [0.004, 0.01], "frequency": [2.0]}
