@@ -25,6 +25,12 @@ from .nominal import Nominal
 
 Array = NDArray[np.float64]
 
+_REACH = 0.6  # states that cost as much as all force, as multiples of what it moves in the machine's own time
+_PACE = 0.3  # of the way home in that time
+_SETTLED = 10.0  # time scales until forces are no longer cut
+_LONGEST = 100.0  # time scales that a way home may take
+_HOME = 3.5  # time constants in which a value falls to a thousandth
+
 
 class EnergyShaping:
     """What brings the energy of a machine to that of its goal, with ``tries`` sets of gains to choose from.
@@ -48,7 +54,8 @@ class EnergyShaping:
         self.model, self.tracked, self.period, self.tries, self.seed = model, tracked, period, tries, seed
         self.nominal, self.a = Nominal(model), int(np.flatnonzero(tracked)[0])
         self.low, self.high = force_limits(model)
-        if not np.isfinite(self.high[self.a] - self.low[self.a]):
+        self.weakest, self.strongest = float(self.low[self.a]), float(self.high[self.a])
+        if not np.isfinite(self.strongest - self.weakest):
             raise PantographError(
                 "swing-up needs to know what the drive can give: set the actuator's ctrlrange"
             )
@@ -72,8 +79,12 @@ class EnergyShaping:
         base = np.zeros(m.nq)
         for name, value in self.given.items():
             base[m.jnt_qposadr[names.index(name)]] = value
+        ends = [[x for x in (0.0, np.pi, -np.pi) if _in_range(m, j, x)][:2] for j in free]
+        if not all(ends):
+            lost = ", ".join(names[j] for j, x in zip(free, ends, strict=True) if not x)
+            raise PantographError(f"neither 0 nor a half turn is in the range of {lost}: name a goal there")
         choices = []
-        for turn in product((0.0, np.pi), repeat=len(free)):
+        for turn in product(*ends):
             q = base.copy()
             q[m.jnt_qposadr[free]] = turn
             choices.append(q)
@@ -98,9 +109,9 @@ class EnergyShaping:
 
     @cached_property
     def rate(self) -> float:
-        """Fastest pole about the goal [rad/s]: the machine's own time scale."""
-        poles = np.abs(np.log(np.abs(np.linalg.eigvals(self.catch_open)))) / self.period
-        return float(max(poles.max(), 1e-3))
+        """How fast the machine falls from its goal, or swings about one that is stable [rad/s]."""
+        poles = np.log(np.linalg.eigvals(self.catch_open).astype(complex)) / self.period
+        return float(max(poles.real.max(), np.abs(poles.imag).max(), 1e-3))
 
     @cached_property
     def catch_open(self) -> Array:
@@ -111,32 +122,70 @@ class EnergyShaping:
         return held_matrices(*linearise_path(self.nominal, *path, inputs=self.tracked), self.period)[0]
 
     @cached_property
+    def spare(self) -> float:
+        """Force [N m, N] that the drive has in both directions beside what holds the goal."""
+        hold = float(self.nominal.weight(self.goal)[self.a])
+        spare = min(hold - self.weakest, self.strongest - hold)
+        if spare > 0.0:
+            return spare
+        raise PantographError(
+            f"the drive cannot hold the goal ({self.goal_says}): that takes {hold:.4g} and some to spare in "
+            f"both directions, but it gives {self.weakest:.4g} to {self.strongest:.4g} [N m, N]"
+        )
+
+    @property
+    def goal_says(self) -> str:
+        """The goal in words."""
+        values = zip(joint_names(self.model), self.goal, strict=False)
+        return ", ".join(f"{name} = {value:.4g}" for name, value in values)
+
+    @cached_property
     def catch(self) -> tuple[Catch, float]:
         """The LQR about the goal and the value below which it brings the machine home.
 
         States cost little beside forces: that makes the basin of cut forces wide. The level is the highest at
-        which 95 % of random states come home in simulation.
+        which 95 % of random states come home in simulation. Raises PantographError when nothing does.
         """
-        rng, n = np.random.default_rng(self.seed), self.model.nv
-        little = 1.0 / min(-self.low[self.a], self.high[self.a])
-        catch = Catch(
-            self.nominal, self.tracked, self.goal, self.period, reach=little, speed=10.0 * little / self.rate
-        )
-        root = np.linalg.cholesky(np.linalg.inv(catch.regulator.P))
+        inverse = np.linalg.inv(self.nominal.mass_matrix(self.goal))
+        # |M^-1|_ia <= sqrt(M^-1_ii M^-1_aa): how fast the drive may move each joint
+        pull = self.spare * np.sqrt(np.diag(inverse) * inverse[self.a, self.a]) / self.rate**2
+        weights = {"reach": _REACH * pull, "speed": _PACE * self.rate * _REACH * pull}
+        catch = Catch(self.nominal, self.tracked, self.goal, self.period, **weights)
+        size = self._size(catch)
+        if not size:
+            raise PantographError(
+                f"no LQR about the goal ({self.goal_says}) brings the machine home within "
+                f"{_LONGEST / self.rate:.3g} s, from however near, with {self.weakest:.4g} to "
+                f"{self.strongest:.4g} [N m, N]: give the drive more, or name another goal"
+            )
+        return catch, size**2
+
+    def _size(self, catch: Catch) -> float:
+        """The square root of the level of a catch; 0 when nothing comes home."""
+        n, rng = self.model.nv, np.random.default_rng(self.seed)
+        P, K, poles = catch.regulator.P, catch.regulator.K, catch.regulator.poles
+        root = np.linalg.cholesky(np.linalg.inv(P))
         x = rng.normal(size=(128, 2 * n))
         x = (x / np.linalg.norm(x, axis=1)[:, None]) @ root.T
+        slowest = float(-np.log(np.abs(poles).max()) / self.period)
+        seconds = _SETTLED / self.rate + min(_HOME / slowest, _LONGEST / self.rate)
 
         def works(size: float) -> bool:
             q, v = self.goal + size * x[:, :n], size * x[:, n:]
-            home = comes_home(catch, q, v, (self.low, self.high), seconds=25.0 / self.rate)
+            home = comes_home(catch, q, v, (self.low, self.high), seconds=seconds)
             return bool(home.mean() >= 0.95)
 
-        size = 1e-3
-        while size < 1e6 and works(2.0 * size):
+        # where |K x| reaches the limit: max K x on x'P x = s^2 is s |K P^-1/2|
+        size = linear = self.spare / float(np.linalg.norm(K @ root))
+        while not works(size):
+            size *= 0.5
+            if size < 1e-3 * linear:
+                return 0.0
+        while size < 1e3 * linear and size >= linear and works(2.0 * size):
             size *= 2.0
         for factor in (2.0**0.5, 2.0**0.25):
             size *= factor if works(factor * size) else 1.0
-        return catch, size**2
+        return size
 
     def push(self, q: Array, v: Array, where: Array, gains: Array) -> Array:
         """Energy shaping, (b, nv), with the driven joints ``where`` (b,) from their goals."""
@@ -144,10 +193,10 @@ class EnergyShaping:
         w, zeta, weight, pull = gains.T
         kinetic, potential = smooth.energy(q, v)
         missing = self.top - kinetic - potential
-        unit = np.zeros(self.model.nv)
-        unit[a] = 1.0
-        b = smooth.forward(q, v)[:, a]
-        c = smooth.forward(q, v, tau=unit)[:, a] - b
+        unit = np.zeros((2 * len(q), self.model.nv))
+        unit[len(q) :, a] = 1.0
+        b, pushed = np.split(smooth.forward(np.tile(q, (2, 1)), np.tile(v, (2, 1)), tau=unit)[:, a], 2)
+        c = pushed - b
         scale = self.lift * weight / self.mobility
         spring = w**2 * where + 2.0 * zeta * w * v[:, a]
         # while energy is missing the denominator may vanish: the sign of the pump is what counts then
@@ -156,12 +205,8 @@ class EnergyShaping:
             np.abs(below) < 0.05 * scale * c, 0.05 * scale * c * np.where(below < 0, -1.0, 1.0), below
         )
         shaped = -(scale * (spring + b)) / safe
-        limit = np.minimum(-self.low[a], self.high[a])
-        push = (
-            limit
-            * np.clip(5.0 * missing / self.lift, -1.0, 1.0)
-            * np.sign(np.where(v[:, a] == 0.0, 1.0, v[:, a]))
-        )
+        way = np.clip(5.0 * missing / self.lift, -1.0, 1.0) * np.where(v[:, a] < 0.0, -1.0, 1.0)
+        push = way * np.where(way < 0.0, -self.weakest, self.strongest)
         pumped = push - pull * spring / c
         tau = np.zeros_like(v)
         tau[:, a] = np.where(below > 0.05 * scale * c, shaped, pumped)
@@ -182,3 +227,9 @@ class EnergyShaping:
     def mobility(self) -> float:
         """Acceleration of the driven joint by its force at the goal [1/(kg m^2), 1/kg]."""
         return float(np.linalg.inv(self.nominal.mass_matrix(self.goal))[self.a, self.a])
+
+
+def _in_range(model: mujoco.MjModel, joint: int, value: float) -> bool:
+    """Whether a joint's range, if it has one, holds a value."""
+    low, high = model.jnt_range[joint]
+    return bool(not model.jnt_limited[joint] or low < value < high)

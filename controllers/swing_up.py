@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models import joint_names
 from ..sim.control import Target
 from .basin import advance
 from .energy_shaping import EnergyShaping
@@ -28,6 +29,8 @@ _ARRIVED, _OFF = 1e12, 1e9  # arrivals are better than any value, whatever cross
 _CATCHING = 2.0  # seconds that a corrected motion has after its nearest point to be caught
 _ALONE = 1.0  # seconds at least without the catch for machines that it would lose
 _WELL_IN = 0.1  # of the catch's level: a machine that it has brought there is home
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_NO_WAY = "no way home was found: more force, foresight, tries or time may do"
 _AS_FORESEEN = 0.01  # rad, m, and per second: a machine so near to where it was foreseen needs no new look
 
 
@@ -72,10 +75,12 @@ class SwingUp:
     ``foresight`` [s] of simulated time is looked ahead for each of ``tries`` sets of gains, and again every
     ``every`` [s] until the catch has the machine, unless it is on its way home as foreseen; zero foresight
     takes the first set. Joints that have a range must stay in it with ``room`` [rad, m] to spare. Hinges
-    count modulo a turn.
+    count modulo a turn: a driven one without a range may end some turns from its goal. :meth:`remarks` tells
+    what became of it.
     Keys of the driven joint play no part. A look ahead takes far longer than a sample (the control bench
     tells how long); the last answer is kept, so that one who asks once before a run has the first one in
-    time. Raises PantographError when the machine has not exactly one driven joint, or no such goal.
+    time. Raises PantographError when the machine has not exactly one driven joint, or no such goal;
+    :meth:`start` when nothing can hold it there.
     """
 
     def __init__(
@@ -202,7 +207,7 @@ class SwingUp:
         several gains ``choice`` (b, c) each, which came nearest after ``when`` (b, c) ticks. From those that
         it would lose although it has them already, ``held`` (b,), the catch keeps its hands for a while."""
         rng, (b, c), p = np.random.default_rng(self.seed), choice.shape, _SAMPLES
-        limit, rows = min(-self.low[self.a], self.high[self.a]), np.arange(b * c)
+        limit, rows = 0.5 * (self.shaping.strongest - self.shaping.weakest), np.arange(b * c)
         when = np.where(held[:, None], np.maximum(when, _ALONE / self.period), when)
         stretch = np.maximum(1.0, np.ceil((when.ravel() + 1.0) / _PARTS))
         until = np.repeat(when.ravel(), p) + _CATCHING / self.period
@@ -269,8 +274,30 @@ class SwingUp:
     # ---- the law on one machine
 
     def start(self) -> SwingMemory:
-        """Nothing decided yet."""
+        """Nothing decided yet. Raises PantographError when no catch can hold the machine at its goal."""
+        _ = self.shaping.catch
         return self.begin(1)
+
+    def remarks(self, q: Array, memory: SwingMemory) -> tuple[str, ...]:
+        """What a person should know of a run that ends at q (nq,) with this memory, as sentences."""
+        goal, name = self.shaping.goal_says, joint_names(self.model)[int(self.model.dof_jntid[self.a])]
+        if not memory.caught[0]:
+            known = bool(np.isfinite(memory.intent.marks).any())
+            hope = "it was on its way home: give the scene more time" if known else _NO_WAY
+            low, high = self.shaping.weakest, self.shaping.strongest
+            return (
+                f"swing-up: not caught at the goal ({goal}) within {memory.tick * self.period:.4g} s; {hope} "
+                f"(the drive of {name!r} gives {low:.4g} to {high:.4g} [N m, N])",
+            )
+        off = float(q[self.a] - self.shaping.goal[self.a])
+        turns = round(off / (2.0 * np.pi)) if self.model.jnt_type[self.a] == _HINGE else 0
+        if not turns:
+            return ()
+        wound = f"{abs(turns)} turn{'s' if abs(turns) > 1 else ''}"
+        return (
+            f"swing-up: {name!r} is held {wound} from its goal, at {q[self.a]:.4g} rad: hinges count modulo "
+            "a turn; one that must not wind up needs a range",
+        )
 
     def __call__(
         self, t: float, q: Array, v: Array, target: Target, memory: SwingMemory
