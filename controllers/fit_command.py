@@ -28,12 +28,14 @@ def fit(
     film: Annotated[
         Path | None, typer.Option(help="Film to write: as keyed on the left, made possible on the right.")
     ] = None,
-    velocity: Annotated[list[str] | None, typer.Option(help="Limit [rad/s, m/s]: 3, or elbow=2.")] = None,
-    acceleration: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^2, m/s^2].")] = None,
-    jerk: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^3, m/s^3].")] = None,
+    velocity: Annotated[
+        list[str] | None, typer.Option(help="Limit [rad/s or deg/s, m/s]: 3, or elbow=2.")
+    ] = None,
+    acceleration: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^2 or deg/s^2, m/s^2].")] = None,
+    jerk: Annotated[list[str] | None, typer.Option(help="Limit [rad/s^3 or deg/s^3, m/s^3].")] = None,
     force: Annotated[list[str] | None, typer.Option(help="Limit [N m, N]; default: the model's.")] = None,
     top_speed: Annotated[
-        list[str] | None, typer.Option(help="Speed where a motor gives nothing more.")
+        list[str] | None, typer.Option(help="Speed [as velocity] where a motor gives nothing more.")
     ] = None,
     ampere: Annotated[
         list[str] | None, typer.Option(help="Current of a joint's drive [A/(N m), A/N].")
@@ -43,7 +45,8 @@ def fit(
         list[str] | None, typer.Option(help="Joint without a drive, beside free joints.")
     ] = None,
     position: Annotated[
-        list[str] | None, typer.Option(help="Range of a joint [rad, m]: elbow=-1:2; default: the model's.")
+        list[str] | None,
+        typer.Option(help="Range of a joint [rad or deg, m]: elbow=-1:2; default: the model's."),
     ] = None,
     hard: Annotated[
         list[float] | None, typer.Option(help="Time of a key to pass through (fit only).")
@@ -57,13 +60,21 @@ def fit(
 ) -> None:
     """Check the keyed motion of a scene against a machine, or make it possible.
 
-    Machine and contacts stand in the scene's table [fit]; options go before it. The exit status is 1 for a
-    motion that is not possible, and for a fit that strays too far ([fit] within) when it is simulated with
-    the scene's controller, or LQR, in the loop.
+    Machine and contacts stand in the scene's table [fit]; options go before it. Where the scene's angles are
+    degrees, so are ranges, speeds, accelerations and jerks of hinges, in [fit] and in options; what is
+    printed is in rad, m, N m, N and A. The exit status is 1 for a motion that is not possible, and for a fit
+    that strays too far ([fit] within) when it is simulated with the scene's controller, or LQR, in the loop.
+
+    Words of [fit] beside those of options: at_rest (true: begins and ends at rest; false: as fast as keyed;
+    default: at rest where the keys are, or are held, else as fast as keyed or slower), effort (weight of
+    forces against deviation from the keys; default: 0.001, and possible keys stay as they are), deviation
+    (weight of it, 1), step (longest piece of the first grid, 0.04 s), tolerance (of the certificate, 0.001),
+    within (0.05 rad or m), and contacts, [[fit.phases]] with sites, start, stop, friction, ground.
     """
     from ..sim.cli import show
     from ..sim.scene.load import load_scene
     from .fit import check
+    from .fit.ends import astray_text
     from .fit.task import LIMITS, task_of
 
     loaded = load_scene(scene)
@@ -77,11 +88,15 @@ def fit(
     clip, phases = task.clip, task.phases
     if not clip.end > clip.start:
         raise PantographError(f"{scene} keys no motion: no joint has two keys")
-    report = check(clip, task.machine, phases=phases)
+    if how != "check":
+        _check_outputs(out, film, keys)
+    report = check(clip, task.machine, phases=phases, at_rest=task.words["at_rest"])
     console.print(_table(report, "as keyed"))
-    _advise(report, phases)
+    _advise(report, task)
     if how == "check":
         raise typer.Exit(0 if report.possible else 1)
+    if lost := astray_text(task.machine, clip, phases):
+        raise PantographError(f"nothing is searched: {lost}")
     if how == "fit":
         with show.status(f"fitting {scene.stem}") as tell:
             found = _fit(task, tell)
@@ -96,7 +111,7 @@ def fit(
         _write_keys(found.clip, scene, _inside(out, keys), loaded.angle == "degree")
     if how == "fit":
         with show.status(f"simulating {scene.stem}"):
-            good = _prove(task, found, loaded.controller) and good
+            good = _prove(task, found) and good
     if film is not None:
         from ..sim.shoot import shoot
 
@@ -110,19 +125,43 @@ def _inside(out: Path, file: Path) -> Path:
     return out / file if file.parent == Path() else file
 
 
+def _check_outputs(out: Path, film: Path | None, keys: Path | None) -> None:
+    """Raise PantographError for files that cannot be written, before work is spent on them."""
+    from ..sim.film import check_path
+    from .tables import check_outputs
+
+    files = [] if keys is None else [_inside(out, keys)]
+    if film is not None:
+        check_path(_inside(out, film))
+        files += [_inside(out, film)] if film.suffix else []  # else a folder of pictures
+    for folder in {out, *(file.parent for file in files)}:
+        check_outputs(folder, [file for file in files if file.parent == folder])
+
+
 def _fit(task: Any, tell: Any) -> Any:
     from .fit import fit as solve
 
     found = solve(task.clip, task.machine, hard=task.hard, phases=task.phases, progress=tell, **task.words)
-    console.print(f"fitted: up to {found.deviation:.3g} rad or m from the keys")
+    if found.certificate.iterations or found.deviation:
+        console.print(f"fitted: up to {found.deviation:.3g} rad or m from the keys")
+    else:
+        console.print("fitted: the keys stay as they are, since they are possible")
     console.print(str(found.certificate), soft_wrap=True, style="" if found.certificate.holds else "yellow")
     return found
 
 
-def _prove(task: Any, found: Any, controller: Any) -> bool:
+def _prove(task: Any, found: Any) -> bool:
     """Whether the simulated motion stays near the fitted one."""
     from .fit import prove
 
+    controller, long = task.controller, found.clip.end - found.clip.start
+    delay = controller.parameters.get("delay", 0.0) if controller else 0.0
+    if isinstance(delay, int | float) and delay >= long:
+        console.print(
+            f"[yellow]note:[/] no force comes in time: the controller's delay of {delay:g} s is as long as "
+            f"the motion, {long:g} s, or longer",
+            soft_wrap=True,
+        )
     proof = prove(found, task.machine, controller=controller, within=task.within)
     console.print(str(proof), soft_wrap=True, style="" if proof.holds else "yellow")
     return bool(proof.holds)
@@ -188,6 +227,8 @@ def _table(report: Any, title: str) -> Table:
         kind = "no drive" if use.kind == "missing force" else use.kind
         if use.kind in ("position", "missing force"):
             limit, share = ("range", "beyond") if use.kind == "position" else ("0", "")
+        if use.kind.endswith("jump"):
+            limit, share = "0", ""
         if not crossed and (use.share < 0.01 or use.kind in ("position", "missing force")):
             little += use.kind != "missing force"
             continue
@@ -200,20 +241,36 @@ def _table(report: Any, title: str) -> Table:
     return table
 
 
-def _advise(report: Any, phases: Any) -> None:
+def _advise(report: Any, task: Any) -> None:
     """What to write where a report would puzzle."""
+    from .fit.ends import astray_text
+    from .fit.task import unlimited
+
+    notes = []
     if not report.uses:
-        console.print(
-            "[yellow]note:[/] this machine has no limits: give some, as --velocity 3 --force shoulder=10, "
-            "or in the scene's \\[fit]",
-            soft_wrap=True,
+        notes.append(
+            "this machine has no limits: give some, as --velocity 3 --force shoulder=10, or in the "
+            "scene's [fit]"
         )
-    if not phases and any(v.kind == "missing force" and "." in v.who for v in report.violations):
-        console.print(
-            "[yellow]note:[/] nothing drives a free joint: what carries it is declared as contacts, "
-            "\\[\\[fit.phases]] with sites, start and stop",
-            soft_wrap=True,
+    notes += unlimited(task)
+    if not task.phases and any(v.kind == "missing force" and "." in v.who for v in report.violations):
+        notes.append(
+            "nothing drives a free joint: what carries it is declared as contacts, [[fit.phases]] with "
+            "sites, start and stop"
         )
+    if lost := astray_text(task.machine, task.clip, task.phases):
+        notes.append(lost)
+    ends = (task.clip.start, task.clip.end)
+    jumps = [v for v in report.violations if v.kind == "speed jump"]
+    if any(v.t in ends for v in jumps):
+        notes.append(
+            "the keys move where the motion is to begin or end at rest, as [fit] at_rest says or since "
+            'they are held there: curve = "clamped" rests at its ends'
+        )
+    if any(v.t not in ends for v in jumps):
+        notes.append('no machine turns a corner at speed; curves "auto", "natural" and "clamped" have none')
+    for note in notes:
+        console.print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
 
 
 def _recording(plan: Any, clip: Any) -> Any:

@@ -309,7 +309,7 @@ def test_a_turn_is_the_cubic_about_its_axis():
     start = normalize(rng.normal(size=4))
     track = keyed_rotation([0, 1], [start, multiply(start, exp(axis))], kind="linear")
     clip = Clip(BALL, {"ball": track}, start)
-    found = fit(clip, machine(BALL), hard=[1.0], deviation=1e-9, effort=1.0, step=0.02)
+    found = fit(clip, machine(BALL), hard=[1.0], deviation=1e-9, effort=1.0, step=0.02, at_rest=True)
     s = np.linspace(0, 1, 301)
     q, v, _ = found.clip.evaluate(s)
     turned = log(multiply(conjugate(start), q))

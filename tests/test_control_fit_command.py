@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from pantograph.controllers.fit import fit, machine, prove
+from pantograph.controllers.fit import check, fit, machine, prove, retime
 from pantograph.controllers.fit.keys import as_keys
 from pantograph.controllers.fit.task import task_of
 from pantograph.controllers.nominal import difference
@@ -219,3 +219,185 @@ def test_a_proof_has_what_the_machine_gives_and_no_more():
     weak = prove(found, replace(able, top_speed=np.array([slow, np.inf])))
     assert not weak.holds
     assert 0.1 < weak.saturated < 1.0
+
+
+SWING = """duration = 1.0
+[[models]]
+file = "planar_2r"
+[[keys]]
+joint = "shoulder"
+times = [0, 0.4, 1.0]
+values = [-1.0, 0.3, 0.0]
+curve = "natural"
+[[keys]]
+joint = "elbow"
+times = [0, 0.6, 1.0]
+values = [0.5, 1.0, 0.7]
+curve = "natural"
+[fit]
+velocity = 6
+"""
+
+
+@pytest.mark.parametrize("how", ["nearest", "fit"])
+def test_a_motion_that_is_possible_comes_back_as_it_is(how, tmp_path):
+    """It moves at both ends, which is no fault; asked to rest there it is one, which check names."""
+    scene = tmp_path / "swing.toml"
+    scene.write_text(SWING)
+    words = [str(scene), "--how", how, "--out", str(tmp_path)]
+    done = CliRunner().invoke(command(), words)
+    assert done.exit_code == 0, done.output
+    assert "as keyed: possible" in done.output
+    recording, keys = load(tmp_path / "swing.fit.npz"), task_of(load_scene(scene)).clip
+    wanted = keys.evaluate(recording.t, left=True)
+    assert np.abs(wanted.v[[1, -2]]).max() > 1.0
+    np.testing.assert_allclose(recording.q, wanted.q, atol=1e-12)
+    np.testing.assert_allclose(recording.v[1:-1], wanted.v[1:-1], atol=1e-12)
+    # held after its end, or asked to rest: the first speed jumps at the end, the second at both
+    for text in (SWING.replace("duration = 1.0", "duration = 1.5"), SWING + "at_rest = true\n"):
+        scene.write_text(text)
+        done = CliRunner().invoke(command(), [str(scene), "--how", "check"])
+        assert done.exit_code == 1
+        assert "speed jump" in done.output
+        assert "rests at its ends" in done.output
+
+
+def test_corners_and_jumps_are_no_motion(tmp_path):
+    """Of a corner by 2 - (-3) rad/s, of a step by 0.5 rad: no machine does either, whatever its limits."""
+    arm = load_model("planar_2r")
+    line = Clip(arm, {"shoulder": keyed([0, 0.5, 1.0], [0.0, 1.0, -0.5], kind="linear")})
+    found = check(line, machine(arm))
+    (jump,) = [v for v in found.violations if v.kind == "speed jump"]
+    assert not found.possible
+    assert (jump.t, jump.value) == pytest.approx((0.5, 5.0))
+    step = Clip(arm, {"shoulder": keyed([0, 0.5, 1.0], [0.0, 0.5, 0.5], kind="step")})
+    (jump,) = [v for v in check(step, machine(arm)).violations if v.kind == "position jump"]
+    assert (jump.t, jump.value) == pytest.approx((0.5, 0.5))
+    ends = Clip(arm, {"shoulder": keyed([0.5, 1.0], [0.0, 1.0], kind="linear")})
+    assert [v.t for v in check(ends, machine(arm)).violations if v.kind == "speed jump"] == [0.5]
+    assert check(ends, machine(arm), at_rest=False).possible
+
+
+def test_fits_at_an_end_that_moves_are_no_faster_than_keyed():
+    """From 4 rad/s where 3 are allowed: it begins at 3 at most, and so does a retimed one."""
+    arm = load_model("planar_2r")
+    clip = Clip(
+        arm,
+        {n: keyed([0, 1.0], [0.0, far], kind="linear") for n, far in (("shoulder", 4.0), ("elbow", -1.0))},
+    )
+    able = machine(arm, velocity=3.0, force={"shoulder": 200.0, "elbow": 80.0})
+    found = fit(clip, able)
+    assert found.certificate.holds
+    begins = found.clip.evaluate(0.0).v
+    assert 1.0 < begins[0] <= 3.0 * (1 + 1e-3)
+    assert -1.0 - 1e-6 <= begins[1] < 0.0
+    with pytest.raises(PantographError, match=r"'shoulder' moves at 4 rad/s or m/s at 0 s, its limit is 3"):
+        fit(clip, able, at_rest=False)
+
+
+FINGERS = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="arm" axis="0 0 1"/>
+<geom size=".1" mass="1" pos=".3 0 0"/><body pos=".5 0 0"><joint name="finger" type="slide" axis="0 1 0"
+range="0.02 0.05"/><geom size=".02" mass=".1"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("how", ["check", "retime", "nearest", "fit"])
+def test_joints_without_keys_that_start_out_of_range_are_named_at_once(how, tmp_path):
+    (tmp_path / "hand.xml").write_text(FINGERS)
+    scene = tmp_path / "hand.toml"
+    text = 'duration = 1.0\n[[models]]\nfile = "hand.xml"\n[[keys]]\njoint = "arm"\ntimes = [0, 1]\n'
+    scene.write_text(text + "values = [0, 1.0]\n")
+    words = [str(scene), "--how", how, "--force", "50", "--out", str(tmp_path)]
+    done = CliRunner().invoke(command(), words)
+    assert done.exit_code == 1
+    assert re.search(r"finger +position +0\.02 +range +beyond", done.output)
+    said = (
+        r"'finger' \(at 0, range 0\.02 to 0\.05 m\); give it a place within by \[initial\.position\], or keys"
+    )
+    assert re.search(said, done.output)
+    if how != "check":
+        assert isinstance(done.exception, PantographError)
+    for each in (fit, retime):
+        task = task_of(load_scene(scene))
+        with pytest.raises(PantographError, match=said):
+            each(task.clip, task.machine)
+    scene.write_text(scene.read_text() + "[initial.position]\nfinger = 0.03\n")
+    assert CliRunner().invoke(command(), words).exit_code == 0
+
+
+def test_limits_of_hinges_are_in_the_unit_of_the_scenes_angles(tmp_path):
+    """One number and one a joint, of the scene and given; forces and slides stay as they are."""
+    (tmp_path / "hand.xml").write_text(FINGERS)
+    scene = tmp_path / "hand.toml"
+    scene.write_text(
+        'duration = 1.0\nangle = "degree"\n[[models]]\nfile = "hand.xml"\n[[keys]]\njoint = "arm"\n'
+        "times = [0, 1]\nvalues = [0, 90]\n[fit]\nvelocity = 180\nacceleration = {arm = 90, finger = 2}\n"
+        "force = 7\nposition = {arm = [-90, 180], finger = [-1, 1]}\n"
+    )
+    able = task_of(load_scene(scene), jerk={"": 360.0, "finger": 5.0}, top_speed={"arm": 720.0}).machine
+    np.testing.assert_allclose(able.velocity, [np.pi, 180.0])
+    np.testing.assert_allclose(able.acceleration, [np.pi / 2, 2.0])
+    np.testing.assert_allclose(able.jerk, [2 * np.pi, 5.0])
+    np.testing.assert_allclose(able.top_speed, [4 * np.pi, np.inf])
+    np.testing.assert_allclose(able.force_high, [7.0, 7.0])
+    np.testing.assert_allclose([able.low, able.high], [[-np.pi / 2, -1.0], [np.pi, 1.0]])
+
+
+def test_the_law_of_a_proof_has_its_words_in_the_unit_of_the_scenes_angles(tmp_path):
+    scene = tmp_path / "late.toml"
+    text = LATE.replace("[fit]", '[roles]\ntracked = ["*"]\n[controller]\nlaw = "pd"\nbacklash = 90\n[fit]')
+    scene.write_text('angle = "degree"\n' + text)
+    assert task_of(load_scene(scene)).controller.parameters["backlash"] == pytest.approx(np.pi / 2)
+
+
+def test_outputs_are_looked_at_before_the_work(tmp_path, monkeypatch):
+    import pantograph.controllers.fit as solved
+
+    scene = tmp_path / "late.toml"
+    scene.write_text(LATE)
+    (tmp_path / "afile").write_text("")
+    monkeypatch.setattr(solved, "fit", None)  # not reached
+    for more in (
+        ["--keys", "afile/k.toml"],
+        ["--out", "afile"],
+        ["--film", "k.xyz"],
+        ["--keys", str(tmp_path)],
+    ):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(PantographError, match=r"cannot write"):
+            CliRunner().invoke(command(), [str(scene), "--how", "fit", *more], catch_exceptions=False)
+
+
+def test_hard_times_are_times_of_keys(tmp_path):
+    scene = tmp_path / "late.toml"
+    scene.write_text(LATE)
+    with pytest.raises(
+        PantographError, match=r"no key to pass through at 0\.55 s; keys near it: 0\.5, 1\.5 s"
+    ):
+        task_of(load_scene(scene), hard=[0.55])
+
+
+def test_drives_that_no_controller_can_use_are_named(tmp_path):
+    """A motor with activation: its force has no limit here, unless one is given."""
+    (tmp_path / "slow.xml").write_text(
+        FINGERS.replace("0.02 0.05", "-1 1").replace(
+            "</mujoco>",
+            '<actuator><general joint="arm" name="slow" dyntype="filter" dynprm="0.1" ctrlrange="-1 1"/>'
+            "</actuator></mujoco>",
+        )
+    )
+    scene = tmp_path / "slow.toml"
+    scene.write_text(
+        'duration = 1.0\n[[models]]\nfile = "slow.xml"\n[[keys]]\njoint = "arm"\ntimes = [0, 1]\n'
+        "values = [0, 1.0]\n"
+    )
+    said = "ideal forces without limit on tracked joint 'arm', instead of actuator 'slow'"
+    assert said in CliRunner().invoke(command(), [str(scene)]).output
+    assert said not in CliRunner().invoke(command(), [str(scene), "--force", "arm=3"]).output
+
+
+def test_a_delay_as_long_as_the_motion_is_told(tmp_path):
+    scene = tmp_path / "late.toml"
+    text = LATE.replace("[fit]", '[roles]\ntracked = ["*"]\n[controller]\nlaw = "pd"\ndelay = 1.5\n[fit]')
+    scene.write_text(text)
+    done = CliRunner().invoke(command(), [str(scene), "--how", "fit", "--out", str(tmp_path)])
+    assert "no force comes in time: the controller's delay of 1.5 s" in done.output

@@ -13,10 +13,12 @@ from ...models import dof_names
 from ...sim.clip import Clip, FreeTrack, Motion, Track
 from ...sim.curves import Curve
 from .contact import Phase, missing
+from .ends import AtRest, astray, jumps, resting
 from .machine import Machine
 
 Array = NDArray[np.float64]
 MISSING = "missing force"
+_JUMPS = ("position jump", "speed jump")
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class Violation:
     """The worst of one kind at one joint: ``value`` against ``limit`` [SI units] at ``t`` [s]; ``share`` is
     the part of the limit in use, above 1 if it is crossed, which it is from ``start`` to ``stop`` [s], maybe
     with pauses. For positions value is how far the joint is from the nearer end of its range (beyond: > 0),
-    for a ``missing force`` what a freedom without a drive would need.
+    for a ``missing force`` what a freedom without a drive would need; a ``position jump`` or ``speed jump``
+    has no limit: no machine does it, its share is infinite.
     """
 
     kind: str
@@ -44,6 +47,9 @@ class Violation:
             )
         if self.kind == "position":
             return f"{self.who}: {self.value:.4g} rad or m beyond its range at {self.t:.3f} s, {ends}"
+        if self.kind in _JUMPS:
+            unit = "rad or m" if self.kind == "position jump" else "rad/s or m/s"
+            return f"{self.who}: {self.kind} of {self.value:.4g} {unit} at {self.t:.3f} s"
         return (
             f"{self.who}: {self.kind} {self.value:.4g} at {self.t:.3f} s, limit {self.limit:.4g} "
             f"({self.share:.0%}), {ends}"
@@ -85,11 +91,20 @@ class Trace(NamedTuple):
     jerk: Array | None
 
 
-def check(clip: Clip, machine: Machine, *, phases: Sequence[Phase] = (), points: int = 2000) -> Report:
+def check(
+    clip: Clip,
+    machine: Machine,
+    *,
+    phases: Sequence[Phase] = (),
+    points: int = 2000,
+    at_rest: AtRest = None,
+) -> Report:
     """Compare a clip with a machine at ``points`` times and more, and on both sides of every break.
 
     Freedoms with keys but without a drive need forces that nothing gives, unless the contacts of ``phases``
-    do: what is missing is a violation as well.
+    do: what is missing is a violation as well. So are jumps of places and speeds, as at the corners of linear
+    keys and at ends that are to be ``at_rest`` (:func:`~.ends.resting`), and joints without keys that start
+    outside of their ranges.
     """
     part = 5
     grid = np.linspace(clip.start, clip.end, max(points // part, 1) + 1)
@@ -100,7 +115,30 @@ def check(clip: Clip, machine: Machine, *, phases: Sequence[Phase] = (), points:
     need = forces(trace.motion, machine)
     loose = np.flatnonzero(~machine.driven & clip.dofs)
     need, _ = missing(machine.model, phases, trace.t, trace.motion.q, need, loose)
-    return report(trace, machine, keyed=clip.dofs, need=need)
+    found = report(trace, machine, keyed=clip.dofs, need=need)
+    return _with(found, _never(clip, machine, phases, resting(clip, at_rest)))
+
+
+def _never(clip: Clip, machine: Machine, phases: Sequence[Phase], ends: tuple[bool, bool]) -> list[Violation]:
+    """What no machine does, and no timing helps: jumps, and joints without keys out of range."""
+    names, out = dof_names(machine.model), []
+    for jump in jumps(clip, ends):
+        kind = _JUMPS[jump.of_speed]
+        out.append(Violation(kind, names[jump.dof], jump.t, jump.size, 0.0, np.inf, jump.t, jump.t))
+    beyond = astray(machine, clip, phases)
+    for dof in np.flatnonzero(beyond):
+        share = 1.0 + float(beyond[dof]) / max(float(machine.high[dof] - machine.low[dof]), 1e-12)
+        row = (names[dof], clip.start, float(beyond[dof]), 0.0, share, clip.start, clip.end)
+        out.append(Violation("position", *row))
+    return out
+
+
+def _with(found: Report, more: list[Violation]) -> Report:
+    if not more:
+        return found
+    every = sorted((*found.uses, *more), key=lambda v: -v.share)
+    over = sorted((*found.violations, *more), key=lambda v: -v.share)
+    return Report(tuple(over), every[0].share, found.t, tuple(every))
 
 
 def follow(clip: Clip, nodes: Array, parts: int = 10, *, jerk: bool = True) -> Trace:

@@ -17,7 +17,7 @@ from ..gains import force_limits, limit_per_joint, per_joint
 from ..nominal import Nominal
 
 Array = NDArray[np.float64]
-Limit = float | Mapping[str, float] | None
+Limit = float | Mapping[str, float] | NDArray[np.float64] | None
 WIDTH = 0.01
 """Speed w [rad/s, m/s] below which dry friction f is smoothed in programs: f v / sqrt(v^2 + w^2)."""
 
@@ -88,7 +88,7 @@ def machine(
 ) -> Machine:
     """The machine of a model: ranges and forces as its file says, the rest as given (None: no limit).
 
-    A limit is one number for all that is ``driven``, or one a joint by name (other joints have none);
+    A limit is one number for all that is ``driven``, (nv,), or one a joint by name (other joints have none);
     ``force`` replaces the file's, and so does ``position``, joint -> (low, high), for the joints that it
     names. Raises PantographError for limits that are not positive, for names of no
     joint, and for a battery that feeds nothing.
@@ -143,4 +143,4 @@ def _moving(model: mujoco.MjModel, what: str, limit: Limit, driven: NDArray[np.b
 
 
 def _limit(model: mujoco.MjModel, what: str, limit: Limit) -> Array:
-    return limit_per_joint(model, what, None if limit == np.inf else limit)
+    return limit_per_joint(model, what, None if isinstance(limit, float) and limit == np.inf else limit)

@@ -28,10 +28,11 @@ def law_words(scene: Scene, model: mujoco.MjModel, words: Mapping[str, Any] | No
         words = scene.controller.parameters if scene.controller else {}
     if scene.angle == "radian":
         return dict(words)
-    return {word: _in_si(model, value) if word in ANGLES else value for word, value in words.items()}
+    return {word: in_si(model, value) if word in ANGLES else value for word, value in words.items()}
 
 
-def _in_si(model: mujoco.MjModel, value: Any) -> Any:
+def in_si(model: mujoco.MjModel, value: Any) -> Any:
+    """A value of angles in degrees, or of each joint by its name, in SI; what is no hinge's stays."""
     if isinstance(value, Mapping):
         return {name: _one(model, str(name), each) for name, each in value.items()}
     return _one(model, "", value)

@@ -29,7 +29,11 @@ class PhaseItem(Item):
 
 
 class FitItem(Item):
-    """Limits in rad, m, s, N, A, one number or one a joint by name; the model's own stand where none is."""
+    """Limits in rad, m, s, N, A, one number or one a joint by name; the model's own stand where none is.
+
+    Where a scene's angles are degrees, so are range, velocity, acceleration, jerk and top_speed of hinges;
+    forces are always N m and N.
+    """
 
     how: Literal["check", "retime", "nearest", "fit"] = Field(
         "check", description="check; retime: fastest timing; nearest timing; fit: nearest motion"
@@ -45,11 +49,19 @@ class FitItem(Item):
     passive: list[str] = Field(default_factory=list, description="joints without a drive, beside free ones")
     hard: list[Finite] = Field(default_factory=list, description="times of keys to pass through, seconds")
     phases: list[PhaseItem] = Field(default_factory=list)
-    effort: NotNegative = Field(1e-3, description="weight of drive forces against deviation from the keys")
+    effort: NotNegative | None = Field(
+        None,
+        description="weight of drive forces against deviation from the keys; default: 0.001, and keys that "
+        "are possible stay as they are",
+    )
     deviation: NotNegative = Field(1.0, description="weight of deviation from the keys")
     step: Positive = Field(0.04, description="longest piece of the first grid, seconds")
     tolerance: Positive = Field(1e-3, description="of the certificate, relative")
-    within: Positive = Field(0.05, description="how far a simulated motion may be from a fitted one, rad, m")
-    at_rest: Switch = Field(
-        True, description="begin and end at rest, else at the keyed velocity, thrown things at any"
+    within: Positive = Field(
+        0.05, description="how far a simulated motion may be from a fitted one, always rad, m"
+    )
+    at_rest: Switch | None = Field(
+        None,
+        description="begin and end at rest, or, false, at the keyed velocity, thrown things at any; default: "
+        "at rest where the keys rest or are held, else as fast as keyed or slower",
     )

@@ -20,16 +20,19 @@ from ....sim.clip import Clip
 from ....sim.errors import PantographError
 from ....sim.kinds import SCALAR
 from ..contact import Phase
+from ..ends import AtRest, astray_text, resting
 from ..fitted import Certificate, Fitted
 from ..machine import Machine
 from ..watch import interruptible, watch
 from .certify import examine
+from .kept import kept
 from .mesh import grid, refined
 from .transcription import Point, Transcription, Wish
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 _CLOSE = 5.0  # tolerances missed with which friction is made sharper
+_EFFORT = 1e-3
 _REACHED = 1e-5  # what constraints may be missed by
 
 
@@ -39,10 +42,10 @@ def fit(
     *,
     hard: Sequence[float] = (),
     phases: Sequence[Phase] = (),
-    effort: float = 1e-3,
+    effort: float | None = None,
     deviation: float = 1.0,
     step: float = 0.04,
-    at_rest: bool = True,
+    at_rest: AtRest = None,
     tolerance: float = 1e-3,
     refine: int = 4,
     most: int = 500,
@@ -51,11 +54,13 @@ def fit(
     """The motion nearest to ``clip`` that ``machine`` can make, through its poses at the ``hard`` times [s].
 
     Minimises the integral of ``deviation`` |q - keys|^2 plus ``effort`` |tau / strength|^2 + jerkiness over
-    all keyed joints; joints without keys move as physics and the fit want, but things that nothing keys,
-    drives or touches are left out. ``phases`` declare contacts, into which sites come without impact. It
-    begins in the first pose, and begins and ends ``at_rest``, or at the keyed velocity; what is then thrown,
-    with keys and without a drive, at any. What has neither is free at the end. ``step`` [s] is the longest
-    piece of the first grid, ``most`` the most iterations on one.
+    all keyed joints. Without a given ``effort`` (then 1e-3), keys that are possible stay as they are, where
+    there are no ``phases``. Joints without keys move as physics and the fit want, but things that nothing
+    keys, drives or touches are left out. ``phases`` declare contacts, into which sites come without impact.
+    It begins in the first pose, and begins and ends ``at_rest``, or (False) at the keyed velocity; by default
+    at rest where the keys are (:func:`~..ends.resting`), else as fast as keyed or slower. What is thrown,
+    with keys and without a drive, does so at any speed; what has neither is free at the end. ``step`` [s] is
+    the longest piece of the first grid, ``most`` the most iterations on one.
 
     Dry friction is smoothed at low speed, where nothing drives below the machine's ``width``, and wider ones
     at first; a drive has to be able to overcome all of it where a joint is as slow, also where it could help
@@ -76,10 +81,16 @@ def fit(
             )
     if not clip.end > clip.start:
         raise PantographError("there is nothing to fit: no joint has two keys")
-    wish = Wish(clip, tuple(hard), tuple(phases), effort, deviation, at_rest)
+    ends = resting(clip, at_rest)
+    weight = _EFFORT if effort is None else effort
+    wish = Wish(
+        clip, tuple(hard), tuple(phases), weight, deviation, ends, slower=not isinstance(at_rest, bool)
+    )
     if text := _hopeless(wish, machine):
         raise PantographError(f"no motion fits: {text}")
     nodes, margin, found, before = grid(clip, hard, phases, step), 1.0, None, None
+    if effort is None and not phases and (same := kept(clip, machine, nodes, ends, tolerance)):
+        return same
     widths = _widths(machine)
     rounds = refine + len(widths)
     able = replace(machine, width=widths.pop(0))
@@ -112,6 +123,8 @@ def _widths(machine: Machine) -> list[float]:
 
 def _hopeless(wish: Wish, machine: Machine) -> str | None:
     """What makes the given poses impossible whatever the motion between them is, in words, or None."""
+    if text := astray_text(machine, wish.clip, wish.phases):
+        return text
     clip, model = wish.clip, machine.model
     t = np.unique([clip.start, *wish.hard])
     q, names = clip.evaluate(t, left=True).q, dof_names(model)
@@ -130,13 +143,30 @@ def _hopeless(wish: Wish, machine: Machine) -> str | None:
                 f"from the pose at {t[k]:g} s to that at {t[k + 1]:g} s {names[dof]!r} moves at "
                 f"{speed[k]:.4g} rad/s or m/s in the mean, its limit is {machine.velocity[dof]:.4g}"
             )
+    return None if wish.slower else _too_fast(wish, machine)
+
+
+def _too_fast(wish: Wish, machine: Machine) -> str | None:
+    """An end that is to have the keyed speed, beyond its limit."""
+    clip, given = wish.clip, machine.driven & wish.clip.dofs
+    for t, rests in zip((clip.start, clip.end), wish.at_rest, strict=True):
+        v = np.abs(clip.evaluate(t, left=t == clip.end).v)
+        over = np.where(given, v - machine.velocity, -np.inf)
+        if not rests and over.max() > 0:
+            dof = int(over.argmax())
+            return (
+                f"at_rest = false begins and ends as fast as keyed: {dof_names(machine.model)[dof]!r} moves "
+                f"at {v[dof]:.4g} rad/s or m/s at {t:g} s, its limit is {machine.velocity[dof]:.4g}"
+            )
     return None
 
 
 def _too_weak(wish: Wish, machine: Machine) -> str:
     """A rest that the drives cannot hold, in words, or nothing: it may be passed, but hardly kept."""
     ends = [t for t in (wish.clip.start, wish.clip.end) if t == wish.clip.start or t in wish.hard]
-    for t in ends if wish.at_rest else ():
+    for t in ends:
+        if not wish.at_rest[t > wish.clip.start]:
+            continue
         if any(p.holds(np.array([t]))[0] for p in wish.phases):
             continue
         weight = machine.nominal.weight(wish.clip.evaluate(t, left=True).q)

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....models import lookup
-from ....sim.clip import Clip
+from ....sim.clip import Clip, Motion
 from ....sim.errors import PantographError
 from ...nominal import difference, moved
 from ..charts import Charts
 from ..contact import Phase, carried, independent, places, sites_of, touching
+from ..ends import moving
 from ..machine import WIDTH, Machine
 
 Array = NDArray[np.float64]
@@ -36,7 +37,8 @@ class Wish(NamedTuple):
     phases: tuple[Phase, ...]
     effort: float
     deviation: float
-    at_rest: bool
+    at_rest: tuple[bool, bool]
+    slower: bool  # ends that move may do so slower than keyed
 
 
 class Point(NamedTuple):
@@ -60,14 +62,6 @@ class Program(NamedTuple):
     equal: int
 
 
-def moving(machine: Machine, wish: Wish) -> NDArray[np.bool_]:
-    """Freedoms (nv,) that a fit is about: not those of things that nothing keys, drives, or touches in a
-    phase, which stay as they are."""
-    tree = machine.model.dof_treeid
-    mine = tree[machine.driven | wish.clip.dofs | carried(machine.model, wish.phases)]
-    return np.asarray(np.isin(tree, mine))
-
-
 class Transcription:
     """The program of a ``wish`` of ``machine`` over nodes ``t`` (n,) [s]."""
 
@@ -76,7 +70,7 @@ class Transcription:
         m = self.model = machine.model
         self.sites = sites_of(m, wish.phases)
         self.driven = np.flatnonzero(machine.driven)
-        self.inside = moving(machine, wish)
+        self.inside = moving(machine, wish.clip, wish.phases)
         self.charts = Charts(m)
         middle = 0.5 * (t[1:] + t[:-1])
         self.touched = {s: touching(wish.phases, s, middle) for s in self.sites}
@@ -90,7 +84,7 @@ class Transcription:
         self.state_of = np.empty(count, dtype=int)
         self.state_of[self.instants] = self.states
         self.times = np.sort(np.concatenate([t, middle]))
-        self.wanted = wish.clip.evaluate(self.times)
+        self.wanted = _within(wish.clip, self.times)
         self.shape = {"x": (nv, len(self.times)), "v": (nv, len(self.times))}
         self.shape |= {"tau": (len(self.driven), len(t)), "a": (nv, count), "f": (3 * len(self.sites), count)}
         weight = np.abs(machine.nominal.smooth.inverse(*self.wanted)).max(axis=0) + 1e-3
@@ -246,8 +240,7 @@ class Transcription:
             # slopes of the parabola at both ends; what is held before and after does not accelerate
             for jerk in ((4.0 * middle - 3.0 * first - last) / H, (first - 4.0 * middle + 3.0 * last) / H):
                 below += [jerk - 1.0, -jerk - 1.0]
-            if self.wish.at_rest:
-                equal += [first[0], last[-1]]
+            equal += [a for a, rests in zip((first[0], last[-1]), self.wish.at_rest, strict=True) if rests]
         for k, dof in enumerate(self.driven.tolist()):
             top, high, low = mm.top_speed[dof], mm.force_high[dof], mm.force_low[dof]
             if np.isfinite(high - low) and (np.isfinite(top) or mm.friction[dof]):
@@ -280,7 +273,7 @@ class Transcription:
                 if phase.ground is not None and not given:
                     equal += [p[r, now[0]] - phase.ground for r in new if r % 3 == 2]
                 # rest at the end follows from rest here, and would be asked for twice
-                if not (wish.at_rest and on[-1] == len(middle) - 1):
+                if not (wish.at_rest[1] and on[-1] == len(middle) - 1):
                     equal += [speed[new, now[0]]]
         grounds = [p.ground for p in wish.phases if p.ground is not None]
         for k, site in enumerate(self.sites):
@@ -316,9 +309,12 @@ class Transcription:
             rows = np.ones(m.nv, dtype=bool) if k == 0 else keyed
             slack = _SLACK if k and any(p.holds(self.times[k : k + 1])[0] for p in self.wish.phases) else 0.0
             low["x"][k, rows], high["x"][k, rows] = -slack, slack
+        most = mm.velocity if self.wish.slower else np.inf
         for k in (0, -1):
             rows = self._bound_speeds(k)
-            low["v"][k, rows] = high["v"][k, rows] = 0.0 if self.wish.at_rest else self.wanted.v[k, rows]
+            v = np.zeros(m.nv) if self.wish.at_rest[k] else np.clip(self.wanted.v[k], -most, most)
+            low["v"][k, rows] = (np.minimum(v, 0.0) if self.wish.slower else v)[rows]
+            high["v"][k, rows] = (np.maximum(v, 0.0) if self.wish.slower else v)[rows]
         for name in ("x", "v", "a"):
             low[name][:, ~self.inside] = high[name][:, ~self.inside] = 0.0
         for k, site in enumerate(self.sites):
@@ -333,7 +329,7 @@ class Transcription:
         wish, driven = self.wish, self.machine.driven
         now = [p for p in wish.phases if p.holds(self.t[[k]])[0]]
         held = driven | carried(self.model, now)
-        if wish.at_rest:
+        if wish.at_rest[k]:
             return held | wish.clip.dofs if k else np.ones(self.model.nv, dtype=bool)
         return held & wish.clip.dofs if k else held | ~wish.clip.dofs
 
@@ -387,6 +383,12 @@ class Transcription:
         x, v, tau, a, f = (p.reshape(size[::-1]) for p, size in parts)
         q = np.array([moved(self.model, wanted, d) for wanted, d in zip(self.wanted.q, x, strict=True)])
         return Point(q, v, tau, a[self.instants], f[self.instants]), x
+
+
+def _within(clip: Clip, t: Array) -> Motion:
+    """A clip at times t (n,), at the last one as it gets there: what is held after it has no speed."""
+    before, last = clip.evaluate(t[:-1]), clip.evaluate(t[-1:], left=True)
+    return Motion(*map(np.concatenate, zip(before, last, strict=True)))
 
 
 def _columns(row: Array) -> list[int]:

@@ -14,7 +14,8 @@ from ....models import dof_names
 from ....sim.clip import Clip, FreeTrack, Motion, Track
 from ....sim.curves import Curve
 from ....sim.errors import PantographError
-from ..check import Report, Trace, Violation, by_piece, follow, report
+from ..check import Report, Trace, Violation, by_piece, check, follow, report
+from ..ends import AtRest, astray_text, resting
 from ..machine import Machine
 from .grid import Grid, even
 from .path import Corner, uneven
@@ -86,17 +87,19 @@ class Retimed:
 
 
 def retime(
-    clip: Clip, machine: Machine, *, keep: bool = False, points: int = 1000, at_rest: bool = True
+    clip: Clip, machine: Machine, *, keep: bool = False, points: int = 1000, at_rest: AtRest = True
 ) -> Retimed:
-    """The timing of ``clip`` that is fastest, or with ``keep`` nearest to its own: nowhere faster than keyed.
+    """The timing of ``clip`` that is fastest, or with ``keep`` nearest to its own: nowhere faster than keyed,
+    and as it is where that is possible.
 
     Limits of velocity, acceleration, force (with the motor's top speed, and dry friction) and current hold;
     the path, the time of the first key, and stretches where nothing moves stay as they are. It starts and
-    ends ``at_rest``, or at the keyed speed. It stops where the path has a corner, as linear keys have, and
-    with a limit on jerk where its curvature jumps, as it does at the keys of curves that are not natural or
-    clamped; the motion is then quintics through points of the path. Raises PantographError where the path
-    itself is impossible (positions out of range, a pose that the drives cannot hold), for freedoms without a
-    drive, and where no timing is found.
+    ends ``at_rest``, or at the keyed speed or slower (False; None: where the keys do, see
+    :func:`~..ends.resting`). It stops where the path has a corner, as linear keys have, and with a limit on
+    jerk where its curvature jumps, as it does at the keys of curves that are not natural or clamped; the
+    motion is then quintics through points of the path. Raises PantographError where the path itself is
+    impossible (positions out of range, also of joints without keys, a pose that the drives cannot hold), for
+    freedoms without a drive, and where no timing is found.
     """
     tree = machine.model.dof_treeid
     loose = np.flatnonzero(~machine.driven & np.isin(tree, tree[clip.dofs]))
@@ -111,10 +114,16 @@ def retime(
     for name, track in clip.tracks.items():
         if isinstance(track, FreeTrack):
             raise PantographError(f"joint {name!r} is free: no machine moves it along keys; fit the motion")
+    if text := astray_text(machine, clip):
+        raise PantographError(f"no timing helps: {text}")
+    ends = resting(clip, at_rest)
+    if keep and (same := check(clip, machine, points=10 * points, at_rest=ends)).possible:
+        t = np.array([clip.start, clip.end])
+        return Retimed(clip, clip.end - clip.start, same, t, t, (), 1.0)
     grid = Grid(clip, machine, even(clip, machine, points))
-    x = grid.fastest(keep, (at_rest, at_rest))
+    x = grid.fastest(keep, ends)
     if np.isfinite(machine.jerk[clip.dofs]).any() or uneven(clip, grid.pauses(), keep=keep):
-        at, s, corners = smooth(clip, machine, grid, x, keep=keep, at_rest=at_rest, points=points)
+        at, s, corners = smooth(clip, machine, grid, x, keep=keep, ends=ends, points=points)
         return _slowed(at, s, corners, machine)
     for _ in range(_ROUNDS):
         at = _parabolas(grid, x)
@@ -123,7 +132,7 @@ def retime(
         if not coarse.any() or len(grid.s) > 8 * points:
             break
         grid = Grid(clip, machine, np.union1d(grid.s, 0.5 * (grid.s[1:] + grid.s[:-1])[coarse]))
-        x = grid.fastest(keep, (at_rest, at_rest))
+        x = grid.fastest(keep, ends)
     return found
 
 

@@ -49,7 +49,7 @@ class _Nodes(NamedTuple):
 
 
 def smooth(
-    clip: Clip, machine: Machine, grid: Grid, x: Array, *, keep: bool, at_rest: bool, points: int
+    clip: Clip, machine: Machine, grid: Grid, x: Array, *, keep: bool, ends: tuple[bool, bool], points: int
 ) -> Smooth:
     """The fastest timing, with bounded jerk or without.
 
@@ -60,7 +60,7 @@ def smooth(
     found = corners(clip, np.isfinite(machine.jerk) & clip.dofs, pauses, keep=keep)
     # a program of many variables, or two passes
     points = points // 8 if np.isfinite(machine.jerk[clip.dofs]).any() else points
-    rows = _stretches(clip, machine, found, pauses, x, at_rest, points)
+    rows = _stretches(clip, machine, found, pauses, x, ends, points)
     back = [c.s for c in found if c.back]
     most = _MOST * sum(len(row.nodes) for row in rows)
     known: list[Timed | None] = [None] * len(rows)
@@ -82,7 +82,7 @@ def _stretches(
     found: list[Corner],
     pauses: list[tuple[float, float]],
     x: Array,
-    at_rest: bool,
+    rests: tuple[bool, bool],
     points: int,
 ) -> list[_Stretch]:
     parts, turns = stretches(clip, found, pauses), reversals(clip, machine.rubs)
@@ -96,8 +96,8 @@ def _stretches(
             rows.append(_Stretch(np.array([a, b]), (0.0, 0.0), None))
             continue
         speeds = (
-            0.0 if at_rest or a > clip.start else first,
-            0.0 if at_rest or b < clip.end else last,
+            0.0 if rests[0] or a > clip.start else first,
+            0.0 if rests[1] or b < clip.end else last,
         )
         many = max(24, round(points * (b - a) / total))
         by = measure(clip, a, b, found, slow)

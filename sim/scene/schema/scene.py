@@ -94,7 +94,7 @@ class Scene(Item):
     angle: Literal["radian", "degree"] = Field(
         "radian",
         description="unit of angles in this scene: of hinges, also of their speeds and accelerations, and of "
-        "euler angles; gains, weights and the table 'fit' have radians, cameras degrees",
+        "euler angles; gains and weights are of radians, cameras have degrees",
     )
     rate: Positive = Field(120.0, description="recorded samples a second, rounded to whole steps")
     models: list[ModelItem] = Field(default_factory=list)
