@@ -187,6 +187,11 @@ class Loop:
         inner: Formula | None = make(period)
         return None if inner is None else LoopFormula(self, inner, period).formula()
 
+    def remarks(self, q: Array, memory: LoopMemory) -> tuple[str, ...]:
+        """What the law remarks; see :class:`~pantograph.sim.control.Law`."""
+        tell = getattr(self.law, "remarks", None)
+        return () if tell is None else tuple(tell(q, memory.law))
+
     def _lost(self, v: Array) -> Array:
         """What dry friction takes (nv,) at speeds ``v`` (nv,), also from a drive at its limit."""
         return np.asarray(-self.friction * np.tanh(v / self.stiction))

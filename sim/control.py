@@ -36,7 +36,8 @@ class Law(Protocol):
     """A control law: the same input and memory give the same output, in any order of calls.
 
     One that also has ``lost(v)`` tells forces (nv,) that act at speeds v (nv,) beside what drives give. One
-    that has ``formula(period)`` gives itself as a :class:`~pantograph.sim.formula.Formula`, or None.
+    that has ``formula(period)`` gives itself as a :class:`~pantograph.sim.formula.Formula`, or None. One that
+    has ``remarks(q, memory)`` tells in sentences how a run went that ended at q (nq,) with this memory.
     """
 
     def start(self) -> Any:
@@ -105,6 +106,11 @@ class Sampled:
         assert self.formula is not None
         ticks = np.arange(first, first + count)
         return self.formula.rows(first, Target(*self.clip.evaluate(ticks * self.period)))
+
+    def remarks(self, q: Array) -> tuple[str, ...]:
+        """What the law has to say of a run that ended at q (nq,)."""
+        tell = getattr(self.law, "remarks", None)
+        return () if tell is None else tuple(tell(q, self.memory))
 
     def _target(self, k: int) -> Target:
         """Where the keys are at tick ``k``; evaluated some ticks at a time."""

@@ -50,7 +50,10 @@ def run(
         segment = engine.run(problem, (0.0, problem.steps * problem.step), controls, progress=progress)
     except Broken as broken:
         segment, failure = broken.segment, broken.__cause__
-    recording = _recorded(plan, segment, engine if error else None, law)
+    remarks: tuple[str, ...] = ()
+    if controls is not None and segment.status == "done":
+        remarks = controls.remarks(segment.q[-1])
+    recording = _recorded(plan, segment, engine if error else None, law, remarks)
     if failure is not None:
         raise RunError(recording) from failure
     return recording
@@ -65,17 +68,21 @@ def _controls(plan: Plan, law: Law | None) -> Sampled | None:
     return Sampled(law, plan.problem, plan.period)
 
 
-def _recorded(plan: Plan, segment: Segment, engine: Engine | None, law: Law | None) -> Recording:
-    """The recording of a segment, with an error estimate when the ``engine`` for it is given."""
+def _recorded(
+    plan: Plan, segment: Segment, engine: Engine | None, law: Law | None, remarks: tuple[str, ...]
+) -> Recording:
+    """The recording of a segment, with what its law remarked, and, where the ``engine`` for it is given, an
+    estimate of its error."""
     problem, setup = plan.problem, plan.setup
     status, message, estimate = segment.status, segment.message, None
-    notes = [*plan.notes, _UNCHECKED]
+    told = [*plan.notes, *remarks]
+    notes = [*told, _UNCHECKED]
     missed: dict[str, Array] = {}
     try:
         derived = derive(problem, segment)
         missed = _missed(setup, segment)
         seen = check_frames(setup, segment.t, segment.q)
-        notes = [*plan.notes, *_sentences(setup, missed, segment.t), *seen]
+        notes = [*told, *_sentences(setup, missed, segment.t), *seen]
         if engine is not None and status == "done" and segment.stats["steps"]:
             estimate = estimate_error(engine, problem, segment, _controls(plan, law))
     except EngineError as e:

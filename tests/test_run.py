@@ -186,6 +186,19 @@ def test_a_law_of_ones_own_drives_a_scene_as_the_same_built_in_one():
         run(passive, law=Spring())
 
 
+@pytest.mark.parametrize("words", [{}, {"encoder": 4096}])
+def test_a_swing_up_that_does_not_arrive_says_so(words):
+    scene = Scene(
+        duration=0.5,
+        models=[{"file": "cart_pole"}],
+        roles={"tracked": ["slide"]},
+        initial={"position": {"hinge": 3.1}},
+        controller={"law": "swing-up", "period": 0.01, "tries": 8, "foresight": 2.0, **words},
+    )
+    (note,) = (note for note in run(scene).notes if "swing-up" in note)
+    assert "not caught at the goal" in note and "0.5 s" in note
+
+
 def test_an_estimate_that_fails_leaves_the_run_and_a_note(monkeypatch):
     def fails(*args):
         raise EngineError("too many impacts")
