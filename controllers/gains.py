@@ -167,13 +167,12 @@ def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
     joint those count whose gear names one axis of the joint's frame. Actuators whose gain depends on position
     or speed are limited by their force range alone.
     """
-    low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    low, high, driven = np.zeros(model.nv), np.zeros(model.nv), np.zeros(model.nv, dtype=bool)
     for i in range(model.nu):
         joint_like = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         gain = float(model.actuator_gainprm[i, 0])
         if int(model.actuator_trntype[i]) not in joint_like or not np.any(model.actuator_gainprm[i, :3]):
             continue
-        joint = int(model.actuator_trnid[i, 0])
         found = _freedom(model, i)
         if found is None:
             continue
@@ -189,14 +188,11 @@ def force_limits(model: mujoco.MjModel) -> tuple[Array, Array]:
             force = model.actuator_forcerange[i]
             ends = np.array([max(ends[0], force[0]), min(ends[1], force[1])])
         ends = np.sort(gear * ends)
-        if np.isneginf(low[dof]) and np.isposinf(high[dof]):
-            low[dof], high[dof] = ends
-        else:
-            low[dof], high[dof] = low[dof] + ends[0], high[dof] + ends[1]
-        if model.jnt_actfrclimited[joint]:  # of hinges and slides
-            low[dof] = max(low[dof], float(model.jnt_actfrcrange[joint, 0]))
-            high[dof] = min(high[dof], float(model.jnt_actfrcrange[joint, 1]))
-    return low, high
+        low[dof], high[dof], driven[dof] = low[dof] + ends[0], high[dof] + ends[1], True
+    limited, bounds = (x[model.dof_jntid] for x in (model.jnt_actfrclimited, model.jnt_actfrcrange))
+    own = driven & limited.astype(bool)  # of hinges and slides
+    low[own], high[own] = np.maximum(low, bounds[:, 0])[own], np.minimum(high, bounds[:, 1])[own]
+    return np.where(driven, low, -np.inf), np.where(driven, high, np.inf)
 
 
 def _freedom(model: mujoco.MjModel, i: int) -> tuple[int, float] | None:

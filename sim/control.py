@@ -128,7 +128,8 @@ class JointActuators:
     force = (g0 + g1 l + g2 l') ctrl + b0 + b1 l + b2 l', l = gear q, joint force = gear * force
     (MuJoCo documentation, Computation, Actuation model).
 
-    index, dof, qpos (n,) in the model; gear, low, high (n,); gain, bias (n, 3).
+    index, dof, qpos (n,) in the model; gear, low, high (n,); gain, bias (n, 3); up, down (n,): parts of their
+    joint's force that they give when it is positive, and when it is negative.
     """
 
     index: NDArray[np.intp]
@@ -139,10 +140,13 @@ class JointActuators:
     bias: Array
     low: Array
     high: Array
+    up: Array
+    down: Array
 
     def ctrl_for(self, tau: Array, q: Array, v: Array) -> Array:
         """The ctrl (n,) that give joint forces ``tau`` (nv,) [N, N m] now, within the control ranges."""
-        force, gain = tau[self.dof] / self.gear, self.gain[:, 0]
+        asked = tau[self.dof]
+        force, gain = asked * np.where(asked < 0.0, self.down, self.up) / self.gear, self.gain[:, 0]
         if not self._motors:
             length, rate = self.gear * q[self.qpos], self.gear * v[self.dof]
             gain = gain + self.gain[:, 1] * length + self.gain[:, 2] * rate
@@ -166,6 +170,10 @@ def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> Joi
     index = np.flatnonzero(drives == Drive.CONTROLLER)
     joints = model.actuator_trnid[index, 0]
     limited = model.actuator_ctrllimited[index].astype(bool)
+    low, high = (
+        np.where(limited, model.actuator_ctrlrange[index, k], s * np.inf) for k, s in ((0, -1), (1, 1))
+    )
+    up, down = _shares(model, index, model.jnt_dofadr[joints], low, high)
     return JointActuators(
         index=index,
         dof=model.jnt_dofadr[joints].astype(np.intp),
@@ -173,9 +181,32 @@ def controlled_actuators(model: mujoco.MjModel, drives: NDArray[np.int8]) -> Joi
         gear=model.actuator_gear[index, 0].copy(),
         gain=model.actuator_gainprm[index, :3].copy(),
         bias=model.actuator_biasprm[index, :3].copy(),
-        low=np.where(limited, model.actuator_ctrlrange[index, 0], -np.inf),
-        high=np.where(limited, model.actuator_ctrlrange[index, 1], np.inf),
+        low=low,
+        high=high,
+        up=up,
+        down=down,
     )
+
+
+def _shares(
+    model: mujoco.MjModel, index: NDArray[np.intp], dof: NDArray[np.intp], low: Array, high: Array
+) -> tuple[Array, Array]:
+    """Parts (n,) of positive and of negative joint forces that actuators of one joint give, as they can."""
+    with np.errstate(invalid="ignore"):
+        ends = np.sort(model.actuator_gainprm[index, :1] * np.column_stack([low, high]), axis=1)
+    ends[np.isnan(ends)] = 0.0  # no gain
+    forced = model.actuator_forcelimited[index].astype(bool)
+    ends[forced] = np.clip(ends[forced], *model.actuator_forcerange[index][forced].T[..., None])
+    ends = np.sort(model.actuator_gear[index, :1] * ends, axis=1)
+    parts = []
+    for able in (np.maximum(ends[:, 1], 0.0), np.maximum(-ends[:, 0], 0.0)):
+        part = np.ones(len(index))
+        for joint in np.unique(dof):
+            mine = dof == joint
+            each = np.isinf(able[mine]) if np.isinf(able[mine]).any() else able[mine]
+            part[mine] = each / each.sum() if each.any() else 1.0 / mine.sum()
+        parts.append(part)
+    return parts[0], parts[1]
 
 
 def keyed_by_servo(model: mujoco.MjModel, drives: NDArray[np.int8]) -> set[int]:

@@ -103,7 +103,7 @@ def test_encoders_of_slides_count_metres_and_noise_can_be_told():
     loop = Loop(Always([0, 0]), model, *made, observer="kalman", encoder=1000)
     np.testing.assert_allclose(loop.observer.noise, np.array([1e-3, 2e-3 * np.pi]) / np.sqrt(12))
     loop = Loop(Always([0, 0]), model, *made, observer="kalman", noise={"slide": 0.1}, push=3.0)
-    np.testing.assert_allclose(loop.observer.noise, [0.1, 1e-3])
+    np.testing.assert_allclose(loop.observer.noise, [0.1, 1e-4])
     np.testing.assert_allclose(loop.observer.push, 3.0)
 
 

@@ -980,3 +980,24 @@ def test_no_whirl_of_impacts_breaks_a_run(seed):
         assert (q >= low - 1e-9).all() and (q <= high + 1e-9).all()
         assert any(e.kind == "limit" for e in segment.events)
     np.testing.assert_allclose(fixed.q, adaptive.q, atol=1e-5)
+
+
+@pytest.mark.parametrize("curve", ["linear", "natural"])
+def test_turns_at_a_constant_rate_are_prescribed_by_tolerance_too(curve):
+    """Components of their acceleration that should be zero are noise, which no polynomial resolves."""
+    turned = [[1, 0, 0, 0], [0.7, 0.3, 0, 0.2]]
+    keys = [{"joint": "root", "channel": "rotation", "times": [0, 0.8], "values": turned, "curve": curve}]
+    scene = Scene(
+        duration=0.8,
+        models=[{"file": "quadruped"}],
+        keys=keys,
+        roles={"keyed": ["root"]},
+        physics={"contacts": "none", "limits": False, "friction": False},
+        solver={"integrator": "dop853", "tolerance": 1e-8},
+    )
+    fixed = Scene(
+        **{**scene.model_dump(exclude_defaults=True), "solver": {"integrator": "dop853", "step": 1e-3}}
+    )
+    ours, theirs = run(scene), run(fixed)
+    assert ours.status == "done" and ours.stats["steps"] < 300
+    np.testing.assert_allclose(ours.q[-1], theirs.q[-1], atol=1e-6)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pantograph.controllers.gains import force_limits
 from pantograph.controllers.ilc import Fed
 from pantograph.sim.clip import Clip
 from pantograph.sim.compose import make_law
-from pantograph.sim.control import Sampled
+from pantograph.sim.control import Sampled, controlled_actuators
 from pantograph.sim.curves import keyed
 from pantograph.sim.engines import tick as ticks
 from pantograph.sim.engines.common import Broken
@@ -292,3 +293,50 @@ def test_a_servo_along_keys_gets_no_help_from_the_controller():
     ours, theirs = both(problem, "pd", {})
     assert_alike(ours, theirs)
     assert np.abs(ours.tick_qfrc[:, 0]).min() > 0 and not ours.tick_qfrc[:, 1].any()
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_actuators_of_one_joint_share_its_force_as_they_can(seed):
+    """Together they give what is asked for, up to all that all of them can."""
+    rng, spec = np.random.default_rng(seed), mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_joint(name="j", type=mujoco.mjtJoint.mjJNT_HINGE)
+    body.add_geom(size=[0.1, 0, 0], pos=[0.1, 0, 0])
+    for k in range(int(rng.integers(1, 4))):
+        act = spec.add_actuator(name=f"a{k}", target="j", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        act.gear[0], act.gainprm[0] = rng.choice([-20.0, 1.0, 3.0]), rng.choice([1.0, 2.5])
+        act.ctrlrange, act.ctrllimited = (
+            rng.choice([[0.0, 1.0], [-0.5, 1.0], [-2.0, 2.0]]),
+            rng.random() < 0.8,
+        )
+        act.forcerange, act.forcelimited = [-0.4, 1.5], rng.random() < 0.3
+    model = spec.compile()
+    low, high = force_limits(model)
+    asked = rng.normal() * 10 ** rng.uniform(-1, 2)
+    data = mujoco.MjData(model)
+    actuators = controlled_actuators(model, np.full(model.nu, Drive.CONTROLLER, dtype=np.int8))
+    data.ctrl[:] = actuators.ctrl_for(np.array([asked]), data.qpos, data.qvel)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.qfrc_actuator, np.clip(asked, low, high), rtol=1e-12)
+
+
+def test_compiled_ticks_share_it_alike():
+    problem = random_machine(5, joints=("hinge", "hinge"), motors=True)
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_joint(name="j", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+    body.add_geom(size=[0.1, 0, 0], pos=[0.1, 0, 0])
+    for gear in (20.0, -20.0, 3.0):
+        act = spec.add_actuator(target="j", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        act.gear[0], act.ctrlrange, act.ctrllimited = gear, [0.0, 1.0], True
+    model = spec.compile()
+    clip = Clip(model, {"j": keyed([0.0, 0.05, 0.1], [[0.0], [0.3], [0.0]], kind="clamped")}, model.qpos0)
+    problem = dataclasses.replace(
+        problem, model=model, clip=clip, roles=np.array([Role.TRACKED], dtype=np.int8),
+        state0=State(np.zeros(1), np.zeros(1), np.zeros(0)),
+        drives=np.full(3, Drive.CONTROLLER, dtype=np.int8),
+    )  # fmt: skip
+    ours, theirs = both(problem, "pd", {})
+    assert_alike(ours, theirs)
+    assert (ours.tick_ctrl[:, :2] > 0).any(axis=0).all()  # pushed both ways

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..compile import jit
 from ..compile.cache import Cache, default_folder, key_of
-from ..compile.graph import Graph, Node, Scalar, clip
+from ..compile.graph import Graph, Node, Scalar, clip, less
 from ..compile.program import Bound, Program, map_source, obtain
 from ..compile.tape import Tape
 from .fingerprint import code_fingerprint
@@ -35,7 +35,7 @@ class Delivered:
     ) -> None:
         self.formula, self.tracked, self.actuators, self._memory = formula, tracked, actuators, memory
         a = actuators
-        parts = (a.index, a.dof, a.qpos, a.gear, a.gain, a.bias, a.low, a.high, tracked)
+        parts = (a.index, a.dof, a.qpos, a.gear, a.gain, a.bias, a.low, a.high, a.up, a.down, tracked)
         self.key = key_of(formula.key, *(np.ascontiguousarray(x).tobytes() for x in parts))
 
     def sizes(self, layout: Layout) -> LawSizes:
@@ -62,10 +62,12 @@ class Delivered:
         """Controls by actuator, and joint forces of freedoms without one; see `JointActuators.ctrl_for`."""
         a, ctrl = self.actuators, dict[int, Scalar]()
         forces: list[Scalar] = [x if on else 0.0 for x, on in zip(tau, self.tracked, strict=True)]
-        each = (x.tolist() for x in (a.index, a.dof, a.qpos, a.gear, a.gain, a.bias, a.low, a.high))
-        for i, dof, qpos, gear, gain, bias, low, high in zip(*each, strict=True):
-            length, rate = gear * q[qpos], gear * v[dof]
-            force = forces[dof] / gear - bias[0] - bias[1] * length - bias[2] * rate
+        parts = (a.index, a.dof, a.qpos, a.gear, a.gain, a.bias, a.low, a.high, a.up, a.down)
+        each = (x.tolist() for x in parts)
+        for i, dof, qpos, gear, gain, bias, low, high, up, down in zip(*each, strict=True):
+            length, rate, asked = gear * q[qpos], gear * v[dof], forces[dof]
+            part = up if up == down else up + (down - up) * less(asked, 0.0)
+            force = asked * part / gear - bias[0] - bias[1] * length - bias[2] * rate
             ctrl[i] = clip(force / gain[0] if gain[0] else 0.0, low, high)
         driven = set(a.dof.tolist())
         return ctrl, [0.0 if dof in driven else x for dof, x in enumerate(forces)]

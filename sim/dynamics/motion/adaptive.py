@@ -20,7 +20,7 @@ from ..layout import Layout
 from .guards import Guards
 from .loops import Loop, compiled_loop, finish
 from .path import Path
-from .prescribed import Pieces, constant, ends, pieces_of
+from .prescribed import Pieces, constant, ends, pieces_of, scale_of_motion
 from .rows import NO_MOTION, NOTHING, Controls, Prescribed, PythonLaw, Start, control_rows, parameter_rows
 
 if TYPE_CHECKING:
@@ -59,7 +59,9 @@ def motion_of(
             raise EngineError(NO_MOTION)
         return constant(np.zeros(0), t0, t1)
     if callable(w):
-        return pieces_of(w, size, t0, t1, breaks, knots)
+        lay = smooth.layout
+        scale = scale_of_motion(len(lay.q_keyed), len(lay.v_keyed))
+        return pieces_of(w, size, t0, t1, breaks, knots, scale)
     value = np.asarray(w, dtype=float)
     if value.shape != (size,):
         raise EngineError(

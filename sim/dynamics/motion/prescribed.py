@@ -25,6 +25,7 @@ BEND = 1e-7
 """The same for what a piece changes by its slope; that of resolved pieces is known to 1e-10."""
 CLOSE = 1e-6
 """Pieces shorter than this part of the time span close in on something that is not smooth."""
+_SHARE = 0.1  # of the largest component, that one of the same kind is rounded as at least
 MOST = 100_000
 """Pieces that are tried at most."""
 
@@ -76,12 +77,14 @@ def pieces_of(
     t1: float,
     breaks: ArrayLike = (),
     knots: ArrayLike = (),
+    scale: Callable[[Array], Array] = np.asarray,
 ) -> Pieces:
     """`motion`, times (n,) -> (n, width), from t0 to t1 as polynomials that agree with it to rounding.
 
     Pieces are halved until their polynomials are resolved; where that never happens is a break, beside those
-    given. `knots`, where its own pieces are known to end, spare halving down to them. Raises EngineError for
-    a motion of another shape, one that is not finite, or one that is too wild.
+    given. `knots`, where its own pieces are known to end, spare halving down to them. `scale` makes of the
+    largest values of the columns what their rounding is measured by. Raises EngineError for a motion of
+    another shape, one that is not finite, or one that is too wild.
     """
     given = np.unique(np.asarray(breaks, dtype=float))
     inner = np.union1d(given, np.asarray(knots, dtype=float))
@@ -95,7 +98,7 @@ def pieces_of(
         largest = np.maximum(largest, np.abs(values).max(axis=(0, 1)))
         c = np.einsum("kp,npw->nwk", _TO_COEFFICIENTS, values)
         tail = np.abs(c[:, :, -2:]).max(axis=2)
-        fine = (tail <= RESOLVED * largest).all(axis=1)
+        fine = (tail <= RESOLVED * scale(largest)).all(axis=1)
         tiny = ~fine & (high - low <= NARROWEST * (t1 - t0))
         done.append((low[fine], high[fine], c[fine]))
         count += len(low)
@@ -107,7 +110,23 @@ def pieces_of(
         low, high = low[~fine & ~tiny], high[~fine & ~tiny]
         middle = 0.5 * (low + high)
         low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
-    return _joined(done, given, t0, t1)
+    return _joined(done, given, t0, t1, scale(largest))
+
+
+def scale_of_motion(nq: int, nv: int) -> Callable[[Array], Array]:
+    """`pieces_of`'s scale for rows that begin with q (nq), v (nv), a (nv) of rotations among others: what
+    rounding leaves of a component that should be zero is that of the others."""
+
+    def scale(largest: Array) -> Array:
+        out, ends = largest.copy(), (nq, nq + nv, nq + 2 * nv)
+        q, v, a = (slice(end - width, end) for end, width in zip(ends, (nq, nv, nv), strict=True))
+        speed = largest[v].max(initial=0.0)
+        for part, least in ((q, largest[q].max(initial=0.0)), (v, speed)):
+            out[part] = np.maximum(out[part], _SHARE * least)
+        out[a] = np.maximum(out[a], _SHARE * max(largest[a].max(initial=0.0), speed**2))
+        return out
+
+    return scale
 
 
 def _sampled(motion: Callable[[Array], ArrayLike], width: int, low: Array, high: Array) -> Array:
@@ -122,7 +141,9 @@ def _sampled(motion: Callable[[Array], ArrayLike], width: int, low: Array, high:
     return values.reshape(*times.shape, width)
 
 
-def _joined(done: list[tuple[Array, Array, Array]], given: Array, t0: float, t1: float) -> Pieces:
+def _joined(
+    done: list[tuple[Array, Array, Array]], given: Array, t0: float, t1: float, scale: Array
+) -> Pieces:
     """Pieces in order; a jump lies in the middle of the gap that it has left, its sides go on up to there."""
     low, high, c = (np.concatenate([part[k] for part in done]) for k in range(3))
     order = np.argsort(low)
@@ -141,10 +162,10 @@ def _joined(done: list[tuple[Array, Array, Array]], given: Array, t0: float, t1:
             parts.append(c[i])
             knots.append(high[i])
     coefficients, edges = np.stack(parts), np.array(knots)
-    coefficients[np.abs(coefficients) <= 1e-15 * np.abs(coefficients).max(axis=(0, 2), keepdims=True)] = 0.0
+    coefficients[np.abs(coefficients) <= 1e-15 * scale[:, None]] = 0.0
     used = np.flatnonzero(coefficients.any(axis=(0, 1)))
     coefficients = np.ascontiguousarray(coefficients[:, :, : used[-1] + 1 if len(used) else 1])
-    broken = _leaps(coefficients, np.diff(edges)) | np.isin(edges[1:-1], np.append(given, jumps))
+    broken = _leaps(coefficients, np.diff(edges), scale) | np.isin(edges[1:-1], np.append(given, jumps))
     _close_in(np.diff(edges), t1 - t0, broken)
     return Pieces(edges, coefficients, np.flatnonzero(broken) + 1)
 
@@ -164,9 +185,8 @@ def _close_in(length: Array, span: float, broken: NDArray[np.bool_]) -> None:
             broken[knot - 1] = True
 
 
-def _leaps(c: Array, length: Array) -> NDArray[np.bool_]:
+def _leaps(c: Array, length: Array, largest: Array) -> NDArray[np.bool_]:
     """Whether values or slopes differ between the two sides of each inner knot."""
-    largest = np.abs(c).max(axis=(0, 2))
     low, high = ends(c)
     leap = np.abs(low[1:] - high[:-1]) > JUMP * largest
     slope = 2.0 * chebyshev.chebder(c, axis=2) / length[:, None, None]
