@@ -6,6 +6,7 @@ import platform
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from .accuracy import estimate_error
 from .checks import check_frames
 from .compose import make_controls, make_engine
-from .control import Law, Sampled
+from .control import Law, Sampled, Target
 from .engines.common import Broken
 from .engines.derive import derive
 from .engines.interface import Array, Engine, Role, Segment
@@ -65,7 +66,33 @@ def _controls(plan: Plan, law: Law | None) -> Sampled | None:
         return make_controls(plan.setup.scene, plan.problem, plan.period)
     if plan.period is None:
         raise EngineError("a law needs joints to drive: name them in the scene's roles.tracked")
-    return Sampled(law, plan.problem, plan.period)
+    if isinstance(law, type) or not (callable(law) and hasattr(law, "start")):
+        raise EngineError(
+            f"a law is an object with start() and __call__(t, q, v, target, memory), not {law!r}"
+        )
+    return Sampled(_Checked(law, plan.problem.model.nv), plan.problem, plan.period)
+
+
+class _Checked:
+    """A law of one's own: what it gives is looked at, so that no number is taken for all joints."""
+
+    def __init__(self, law: Law, nv: int) -> None:
+        self.law, self.nv = law, nv
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.law, name)
+
+    def start(self) -> Any:
+        return self.law.start()
+
+    def __call__(self, t: float, q: Array, v: Array, target: Target, memory: Any) -> tuple[Array, Any]:
+        given = self.law(t, q, v, target, memory)
+        if not (isinstance(given, tuple) and len(given) == 2):
+            raise EngineError(f"a law returns its forces and its memory, not {type(given).__name__}")
+        tau = np.asarray(given[0], dtype=float)
+        if tau.shape != (self.nv,):
+            raise EngineError(f"a law gives a force for each of {self.nv} freedoms, not shape {tau.shape}")
+        return tau, given[1]
 
 
 def _recorded(

@@ -184,6 +184,18 @@ def test_a_law_of_ones_own_drives_a_scene_as_the_same_built_in_one():
     passive = Scene(duration=1.0, models=[{"file": "pendulum"}])
     with pytest.raises(EngineError, match=r"roles\.tracked"):
         run(passive, law=Spring())
+    for answer, said in (
+        (1.0, "not float"),
+        ((1.0, None), r"not shape \(\)"),
+        (([1.0, 2.0], None), r"not shape \(2,\)"),
+    ):
+        spring = Spring()
+        spring.__class__ = type("Odd", (Spring,), {"__call__": lambda *args, answer=answer: answer})
+        with pytest.raises(RunError, match=said):
+            run(scene, law=spring)
+    for what in (Spring, "pd", lambda *args: 0.0):
+        with pytest.raises(EngineError, match="a law is an object with start"):
+            run(scene, law=what)
 
 
 @pytest.mark.parametrize("words", [{}, {"encoder": 4096}])

@@ -61,7 +61,8 @@ def notes(result: Comparison) -> Iterator[str]:
     for law in dict.fromkeys(row.variant.law for row in result.rows):
         told = [row.variant.words for row in result.rows if row.variant.law == law]
         common = [w for w in told[0] if w != PERIOD and all(words.get(w) == told[0][w] for words in told)]
-        yield f"{law} is told: {', '.join(f'{w} = {shown(told[0][w])}' for w in common) or 'nothing'}"
+        if common:
+            yield f"{law} is told: {', '.join(f'{w} = {shown(told[0][w])}' for w in common)}"
     for name, why in result.unfit.items():
         yield f"{name}: cannot, because {why}"
     yield from _failures(result)

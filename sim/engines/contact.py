@@ -303,7 +303,8 @@ class _Run:
                 f"the springs or servo gains (up to {max(kp, stiff):g}) are probably too stiff; "
                 "try integrator = 'discrete' or a smaller step"
             )
-        return "the motion is too fast for the step; try a smaller one, or check forces and initial state"
+        sooner = "a smaller one" + (", or a smaller period of the controller" if self.controls else "")
+        return f"the motion is too fast for the step; try {sooner}, or check forces and initial state"
 
     def _result(self, status: str, message: str, k: int, wall: float) -> Segment:
         stats: dict[str, Any] = {

@@ -333,10 +333,11 @@ class Run(ABC):
         joint = fastest_joint(self.problem.model, q, v)
         if joint is None:
             return ""
+        sooner = "a smaller step" + (" or period of the controller" if self.controls else "")
         return (
             f"diverged at t = {self.now:.4g} s at joint {joint!r}: with {self.problem.integrator} and "
-            f"{self.pace} the motion is too fast or too stiff; try a smaller step, or check forces and "
-            "initial state"
+            f"{self.pace} the motion is too fast or too stiff; try {sooner}, or check forces and initial "
+            "state"
         )
 
     @property
