@@ -201,14 +201,14 @@ def test_a_law_of_ones_own_drives_a_scene_as_the_same_built_in_one():
 @pytest.mark.parametrize("words", [{}, {"encoder": 4096}])
 def test_a_swing_up_that_does_not_arrive_says_so(words):
     scene = Scene(
-        duration=0.5,
+        duration=0.1,
         models=[{"file": "cart_pole"}],
         roles={"tracked": ["slide"]},
         initial={"position": {"hinge": 3.1}},
         controller={"law": "swing-up", "period": 0.01, "tries": 8, "foresight": 2.0, **words},
     )
     (note,) = (note for note in run(scene).notes if "swing-up" in note)
-    assert "not caught at the goal" in note and "0.5 s" in note
+    assert "not caught at the goal" in note and "0.1 s" in note
 
 
 def test_an_estimate_that_fails_leaves_the_run_and_a_note(monkeypatch):

@@ -174,6 +174,8 @@ class Follower:
             held = (*self._pushed(here, d, low, high), *walls)
             still = began - here.cost <= _GAIN * here.cost
             held = held or (("no step nearer",) if still else ("under way",))
+            if still:  # what lies ahead may be beyond a singular pose, where no step from here leads
+                self._aim = None
         return Tick(frozen(self.q), frozen(self.v), residuals(problem, self.q), met, held)
 
     def _at(self, problem: Problem, q: Array, allowed: list[_Least]) -> _Point:
