@@ -316,10 +316,10 @@ def test_joints_without_keys_that_start_out_of_range_are_named_at_once(how, tmp_
     assert re.search(said, done.output)
     if how != "check":
         assert isinstance(done.exception, PantographError)
-    for each in (fit, retime):
-        task = task_of(load_scene(scene))
-        with pytest.raises(PantographError, match=said):
-            each(task.clip, task.machine)
+    task = task_of(load_scene(scene))
+    with pytest.raises(PantographError, match=said):
+        fit(task.clip, task.machine)
+    assert retime(task.clip, task.machine).clip.end > 0  # by itself it is about the path alone
     scene.write_text(scene.read_text() + "[initial.position]\nfinger = 0.03\n")
     assert CliRunner().invoke(command(), words).exit_code == 0
 

@@ -15,7 +15,7 @@ from ....sim.clip import Clip, FreeTrack, Motion, Track
 from ....sim.curves import Curve
 from ....sim.errors import PantographError
 from ..check import Report, Trace, Violation, by_piece, check, follow, report
-from ..ends import AtRest, astray_text, resting
+from ..ends import AtRest, resting
 from ..machine import Machine
 from .grid import Grid, even
 from .path import Corner, uneven
@@ -98,7 +98,7 @@ def retime(
     :func:`~..ends.resting`). It stops where the path has a corner, as linear keys have, and with a limit on
     jerk where its curvature jumps, as it does at the keys of curves that are not natural or clamped; the
     motion is then quintics through points of the path. Raises PantographError where the path itself is
-    impossible (positions out of range, also of joints without keys, a pose that the drives cannot hold), for
+    impossible (positions out of range, a pose that the drives cannot hold), for
     freedoms without a drive, and where no timing is found.
     """
     tree = machine.model.dof_treeid
@@ -114,8 +114,6 @@ def retime(
     for name, track in clip.tracks.items():
         if isinstance(track, FreeTrack):
             raise PantographError(f"joint {name!r} is free: no machine moves it along keys; fit the motion")
-    if text := astray_text(machine, clip):
-        raise PantographError(f"no timing helps: {text}")
     ends = resting(clip, at_rest)
     if keep and (same := check(clip, machine, points=10 * points, at_rest=ends)).possible:
         t = np.array([clip.start, clip.end])
